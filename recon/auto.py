@@ -30,10 +30,9 @@ _SMALLEST = 64  # detectors with fewer pixels along a side are not binned
 class Auto(Method):
     """Tries methods on a part of the scan, and takes the simplest method that is about as good as the best one.
 
-    The measure of a method is how well its volume predicts the held-out projections.
-
-    The part is the sixteen rows with most material; in a cone beam, the sixteen rows in the middle. If these rows
-    contain little material, the part is all rows at half the resolution. One of eight projections is held out. Test
+    The measure of a method is how well its volume predicts the held-out projections. `Auto` tries the methods on the
+    sixteen rows with most material; in a cone beam, on the sixteen rows in the middle. If these rows contain little
+    material, it tries the methods on all rows at half the resolution. One of eight projections is held out. Test
     reconstructions need at least 16 projections; with fewer, `Auto` uses the last candidate. docs/choosing.md gives the
     reasons.
 

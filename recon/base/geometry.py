@@ -250,7 +250,9 @@ class Geometry:
 
     @property
     def is_off_middle(self) -> bool:
-        """Whether the axis is off the detector's middle by more than a twentieth of its width (half acquisition)."""
+        """Whether the axis is off the detector's middle by more than a twentieth of the detector's width (half
+        acquisition).
+        """
         cols = self.detector_shape[1]
         axis = (self.axis_col + self.offsets[:, 0])[self.is_centred]
         return abs(float(axis.mean()) - (cols - 1) / 2) > _OFF_MIDDLE * cols
@@ -358,8 +360,8 @@ class Geometry:
         projections.
 
         Raises:
-            ValueError: there are no angles, or an angle is not finite. The error is also raised if shift, roll, tilt or
-                centre differ between projections, because the values at a new angle are then unknown.
+            ValueError: there are no angles, an angle is not finite, or shift, roll, tilt or centre differ between
+                projections. If they differ, their values at a new angle are unknown.
         """
         for name in _OF_VIEWS[1:]:
             widest = float(np.ptp(getattr(self, name), axis=0).max())

@@ -138,11 +138,12 @@ class EarlyTv(FistaTv):
 class OsSirtTv(VoxelMethod):
     """Ordered-subset SIRT with a proximal step of total variation and momentum after each iteration.
 
-    The iterations end when the volume has converged. SIRT weighs rays by the inverse of their length in the volume.
-    Rays through much material carry fewer photons, so the method suits very few photons (10 to 30 per pixel: up to 2 dB
-    better than FISTA-TV). For a cone beam, the weight of total variation is set from the noise. On a scan of a thorax,
-    the PSNR of OS-SIRT-TV is 2.3 dB lower than that of FISTA-TV, which chooses the weight with held-out projections.
-    The momentum follows Kim, Ramani & Fessler (2015, IEEE TMI 34, 167). Memory: 9 volumes and 3 times the projections.
+    The iterations end when the volume has converged. The weight of a ray is the inverse of the length of the ray in the
+    volume. Long rays usually pass through more material and carry fewer photons. Therefore the method suits scans with
+    very few photons (10 to 30 per pixel: up to 2 dB better than FISTA-TV). For a cone beam, the weight of total
+    variation is set from the noise. On a scan of a thorax, the PSNR of OS-SIRT-TV is 2.3 dB lower than that of
+    FISTA-TV, which chooses the weight with held-out projections. The momentum follows Kim, Ramani & Fessler (2015, IEEE
+    TMI 34, 167). Memory: 9 volumes and 3 times the projections.
 
     Attributes:
         iterations: largest number of iterations over all projections.
