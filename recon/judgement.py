@@ -27,7 +27,7 @@ from recon.voxels.matter_checks import (
     unexplained_memory,
 )
 from recon.voxels.odd_views import OddView, odd_views, odd_views_memory
-from recon.voxels.one_projection import Check, project_parts
+from recon.voxels.one_projection import RayCheck, project_parts
 from recon.voxels.residuals import SquaresLeft, residual, uniform_residual
 
 _VIEWS = 16  # largest number of used projections in the residual; limits the time
@@ -110,7 +110,7 @@ def judge(
     work = stray_mass_share(seen.geometry, grid) if Aspect.STRAY in aspects else 0.0
     looks_for_odd = fitted and time.leaves((work + _ODD_VIEWS_WORK) * seconds)
 
-    used, nothing = np.setdiff1d(np.arange(len(views.data)), views.held_out), Check[Any]((), lambda: None)
+    used, nothing = np.setdiff1d(np.arange(len(views.data)), views.held_out), RayCheck[Any]((), lambda: None)
     left = residual(grid, seen, _VIEWS).renumbered(used) if compares else nothing
     left_unseen = nothing
     if compares and unseen is not None:

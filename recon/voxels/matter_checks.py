@@ -21,7 +21,7 @@ from recon.base.view_data import Views
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import fbp, fbp_memory, is_gridded
-from recon.voxels.one_projection import Check, Part, in_bands
+from recon.voxels.one_projection import AskedRays, RayCheck, in_bands
 from recon.voxels.projector import Projector, projection_images, seen_rays
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution
 from recon.voxels.view_weights import seen_by
@@ -173,7 +173,7 @@ class Unexplained:
     significance: F32
 
 
-def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> Check[Unexplained | None]:
+def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> RayCheck[Unexplained | None]:
     """Filtered back-projection of the residual p - A x, divided by its noise (measured with random signs).
 
     If projections get random signs, structure cancels because all projections share it, and noise remains (our own
@@ -189,7 +189,7 @@ def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> Check[
         The check. Its result is None for a cone, rolled or tilted projections, fewer than 16 projections, other slices,
         or a volume without material.
     """
-    nothing: Check[Unexplained | None] = Check((), lambda: None)
+    nothing: RayCheck[Unexplained | None] = RayCheck((), lambda: None)
     geometry, slices = seen.geometry, volume.grid.shape[0]
     rows_differ = geometry.is_cone or not geometry.is_straight or volume.grid != Grid.matching(geometry)
     if rows_differ or geometry.n_views < _LEAST_VIEWS:
@@ -208,10 +208,10 @@ def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> Check[
     if level <= 0 or not matter.any():
         return nothing
     shown, model = seen.rows(rows), list[F32]()
-    parts = [Part(np.arange(geometry.n_views), rows, lambda lines: model.append(projection_images(lines)))]
+    parts = [AskedRays(np.arange(geometry.n_views), rows, lambda lines: model.append(projection_images(lines)))]
     if not in_bands(geometry, volume.grid):  # the rows also show other slices, so these slices are projected alone
         parts, model = [], [Projector(shown.geometry, box).forward(part.data)]
-    return Check(parts, lambda: _structure(shown, model[0], part, first, matter, rng))
+    return RayCheck(parts, lambda: _structure(shown, model[0], part, first, matter, rng))
 
 
 def _structure(

@@ -15,7 +15,7 @@ from recon.base.geometry import Geometry
 from recon.base.noise import deviation_between_neighbours
 from recon.base.view_data import Views
 from recon.base.volume import Grid
-from recon.voxels.one_projection import Check, Part, in_bands
+from recon.voxels.one_projection import AskedRays, RayCheck, in_bands
 from recon.voxels.projector import projection_images
 
 LIMIT = 12.0
@@ -54,7 +54,7 @@ class OddView:
     cols: tuple[int, int]
 
 
-def odd_views(grid: Grid, views: Views) -> Check[tuple[OddView, ...]]:
+def odd_views(grid: Grid, views: Views) -> RayCheck[tuple[OddView, ...]]:
     """Projections in which something crossed the beam or the sample was displaced, found in the differences p - A x.
 
     The check takes the difference of each projection from that of the volume, minus the common change of its pixels
@@ -70,7 +70,7 @@ def odd_views(grid: Grid, views: Views) -> Check[tuple[OddView, ...]]:
     geometry, side = views.geometry, _side(views.geometry)
     every, rows = np.arange(geometry.n_views), geometry.detector_shape[0]
     if every.size < _LEAST_VIEWS:
-        return Check((), lambda: ())
+        return RayCheck((), lambda: ())
     cells = _Cells(*(np.zeros((every.size, rows // side, geometry.detector_shape[1] // side), np.float32)
                      for _ in range(6)))  # fmt: skip
     if in_bands(geometry, grid):
@@ -80,8 +80,8 @@ def odd_views(grid: Grid, views: Views) -> Check[tuple[OddView, ...]]:
     else:
         groups = (every[first : first + _AT_A_TIME] for first in range(0, every.size, _AT_A_TIME))
         asked = [(some, slice(0, rows), slice(0, rows)) for some in groups]
-    parts = [Part(some, around, partial(_fill, cells, views, some, own, around)) for some, own, around in asked]
-    return Check(parts, lambda: _odd(*_differences(cells, side), geometry, side))
+    parts = [AskedRays(some, around, partial(_fill, cells, views, some, own, around)) for some, own, around in asked]
+    return RayCheck(parts, lambda: _odd(*_differences(cells, side), geometry, side))
 
 
 def _odd(differences: F32, edges: F32, geometry: Geometry, side: int) -> tuple[OddView, ...]:

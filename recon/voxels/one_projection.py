@@ -22,7 +22,7 @@ _AT_A_TIME = 8  # number of projections that are computed together, if rows do n
 Found = TypeVar("Found")
 
 
-class Part(NamedTuple):
+class AskedRays(NamedTuple):
     """Rays that a check compares with the projection of the volume.
 
     Attributes:
@@ -38,16 +38,14 @@ class Part(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Check(Generic[Found]):
-    """A check of a volume by its projections: the rays that it compares, and its result after all rays were
-    compared.
-    """
+class RayCheck(Generic[Found]):
+    """A check of a volume by its projections: the rays that it compares, and its result once all were compared."""
 
-    parts: Sequence[Part]
+    parts: Sequence[AskedRays]
     result: Callable[[], Found]
 
-    def renumbered(self, numbers: I64) -> Check[Found]:
-        """The same check, with its projections 0, 1, ... renumbered: `numbers` has the new numbers, ascending."""
+    def renumbered(self, numbers: I64) -> RayCheck[Found]:
+        """The same check of projections with these ascending numbers, in place of 0, 1, ..."""
         return replace(self, parts=[part._replace(views=numbers[part.views]) for part in self.parts])
 
     def alone(self, volume: Volume, geometry: Geometry) -> Found:
@@ -64,7 +62,7 @@ def in_bands(geometry: Geometry, grid: Grid) -> bool:
 def project_parts(
     volume: Volume,
     geometry: Geometry,
-    parts: Sequence[Part],
+    parts: Sequence[AskedRays],
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> None:
     """Project a volume once and give each part its projection.
@@ -96,7 +94,7 @@ class _Block(NamedTuple):
 class _Waiting:
     """A part whose projection is not complete yet: its lines, and the number of missing rows of all projections."""
 
-    part: Part
+    part: AskedRays
     lines: F32 | None = None
     missing: int = field(init=False)
 

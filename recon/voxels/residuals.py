@@ -15,7 +15,7 @@ from recon.base.slabs import part_of
 from recon.base.view_data import Views
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume
-from recon.voxels.one_projection import BAND, Check, Part, in_bands
+from recon.voxels.one_projection import BAND, AskedRays, RayCheck, in_bands
 from recon.voxels.projector import Projector, projection_lines, volume_lines
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution
 from recon.voxels.voxel_problem import whitened
@@ -93,7 +93,7 @@ class _Compared(NamedTuple):
     places: I64  # of the views among all compared ones
 
 
-def residual(grid: Grid, views: Views, most: int) -> Check[tuple[SquaresLeft, float]]:
+def residual(grid: Grid, views: Views, most: int) -> RayCheck[tuple[SquaresLeft, float]]:
     """The residual of a volume on this grid in at most `most` projections, evenly spread.
 
     If a detector has more than 2^17 pixels, only bands of rows with about this number of pixels are used.
@@ -110,8 +110,8 @@ def residual(grid: Grid, views: Views, most: int) -> Check[tuple[SquaresLeft, fl
         sums[:, part.places] += _summed(model - seen, lines, counts)
         along[:] += [np.square(_without_means(image, counts)).sum() for image in (model - seen, lines)]
 
-    parts = [Part(each.views, each.rows, partial(compare, each)) for each in compared]
-    return Check(parts, lambda: (SquaresLeft(*sums), math.sqrt(along[0] / along[1]) if along[1] else 0.0))
+    parts = [AskedRays(each.views, each.rows, partial(compare, each)) for each in compared]
+    return RayCheck(parts, lambda: (SquaresLeft(*sums), math.sqrt(along[0] / along[1]) if along[1] else 0.0))
 
 
 def uniform_residual(grid: Grid, views: Views, most: int) -> tuple[float, int]:
