@@ -1,4 +1,6 @@
-"""What a configuration plans: angles, blocks of frames, camera settings and the positions of offset projections."""
+"""Planned: what a configuration plans: angles, blocks of frames, camera settings and the positions of offset
+projections.
+"""
 
 from __future__ import annotations
 

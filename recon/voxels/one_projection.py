@@ -39,13 +39,15 @@ class AskedRays(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RayCheck(Generic[Found]):
-    """A check of a volume by its projections: the rays that it compares, and its result once all were compared."""
+    """A check of a volume by its projections: the rays that it compares, and its result after all rays were
+    compared.
+    """
 
     parts: Sequence[AskedRays]
     result: Callable[[], Found]
 
     def renumbered(self, numbers: I64) -> RayCheck[Found]:
-        """The same check of projections with these ascending numbers, in place of 0, 1, ..."""
+        """The same check, with its projections 0, 1, ... renumbered: `numbers` has the new numbers, ascending."""
         return replace(self, parts=[part._replace(views=numbers[part.views]) for part in self.parts])
 
     def alone(self, volume: Volume, geometry: Geometry) -> Found:
