@@ -104,7 +104,7 @@ class Instrument:
             sample: name of the sample, which is written to the file and into the folder's name; None: the configured
                 name.
             energy_kev: energy of the beam, written to the file. If a monochromator is configured, the monochromator
-            moves to this energy.
+                moves to this energy.
             set: configuration values for this scan only, such as {"scan.angles.views": 90}.
             output: folder in which the run's folder is created; None: `storage.folder`.
             live: False: without a live reconstruction, even if `recon.live` is on.
@@ -189,7 +189,7 @@ def connect(
         config: path of the configuration file.
         set: values that replace values of the file, such as {"scan.angles.views": 90}.
         ask: function that asks the operator to move the shutter or the sample by hand, and returns when the operator
-        has done it; None: the operator is asked at the terminal.
+            has done it; None: the operator is asked at the terminal.
         say: function that gets each message that a command would print, for example `print` or the `info` of a logger;
             None: no messages.
 
@@ -228,8 +228,8 @@ def plan(
 
     Args:
         scans: each is a configuration file, a table of scans (.csv), a row of a table of scans as a mapping, such as
-        {"config": "my.yaml", "sample.name": "cell_1", "scan.exposure_s": 0.1}, or a plan of bluesky, such as
-        `fly(scan)`. A plan of bluesky is read without running it, and cannot be run afterwards.
+            {"config": "my.yaml", "sample.name": "cell_1", "scan.exposure_s": 0.1}, or a plan of bluesky, such as
+            `fly(scan)`. A plan of bluesky is read without running it, and cannot be run afterwards.
         set: values that replace values in all configurations, such as {"scan.angles.views": 90}.
         output: folder in which the scans would create the folders of their runs; None: `storage.folder`.
         rehearse: plan a real configuration with simulated devices.

@@ -72,8 +72,8 @@ def reconstruct(
         selection: further options, such as Selection(axis_col=1023.5, steps=(Rings("vo"),)), whose steps are in
             `beamline.projections.corrections`. The arguments above take precedence.
         output: file for the volume, as for the option -o (.h5, .tif, .npy, ...). The report is written next to this
-        file. If `output` is None, no file is written. If the scan does not fit into the memory, an output file is
-        required.
+            file. If `output` is None, no file is written. If the scan does not fit into the memory, an output file is
+            required.
         say: function that gets each message that the command would print; None: no messages.
 
     Raises:

@@ -193,7 +193,7 @@ def connect(
 
     Raises:
         DeviceError: a device does not answer. Before the error is raised, the devices that were opened are closed
-        again.
+            again.
         ConfigError: the simulated scene is wrong.
     """
     with ExitStack() as opened:

@@ -84,7 +84,7 @@ class ConsistencyCondition:
     Attributes:
         residual: by how much the condition is violated, in `unit`.
         tolerance: larger residuals are reported. In scans of a sample at rest, hardening, phase, scatter and noise
-        cause smaller residuals.
+            cause smaller residuals.
         sentence: what was found, where, and what to do.
     """
 

@@ -65,7 +65,7 @@ class ScanCorrectionPlan:
         references: darks and flats of the rows that are read, binned; None: the frames are already line integrals.
         photons: how pixels count photons; None: logarithms are taken.
         light: float64 [frame], factor that scales the frame to the usual exposure and, on request, to the median ring
-        current; None: 1 for all.
+            current; None: 1 for all.
         shadow: objects in the beam of all projections; None: not searched for, or too few projections.
         beam_done: what was done about flats, defects and noise, as texts by name.
         warnings: sentences on damaged references, on zingers in them, and on parts of the scan without flats.
@@ -127,7 +127,8 @@ def survey(scan: SelectedScan, views: NDArray[np.int64] = NO_VIEWS) -> ScanCorre
 
     Raises:
         ConfigError: rows or binning do not fit the detector; photon counting was requested, but the scan has no counts
-        or the counts per photon are unknown; there are too few flats for dynamic flats; or the ring current is missing.
+            or the counts per photon are unknown; there are too few flats for dynamic flats; or the ring current is
+            missing.
         DataError: references that cannot be used.
     """
     source, settings = scan.source, CorrectionSettings()

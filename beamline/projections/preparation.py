@@ -24,12 +24,13 @@ class Preparation:
             checks the frames now, and the new flags replace the flags in the file. "ignore": all projections have equal
             weight.
         references: "accept": all darks and flats are used as they are, even if they are saturated, dark or uneven, or
-        if darks were exposed to the beam.
+            if darks were exposed to the beam.
         noise: "log": logarithms of counts; "counts": line integrals and weights that represent the likelihood of the
             counts; "auto": "counts" if the open beam has few photons per pixel.
         gain: counts per photon of a single pixel; None: found from the flats.
         flat_fields: "groups": a projection's flat is interpolated between groups of flats; "dynamic": principal
-        components of the flats are added with the amplitudes that the projection shows, see `recon.prep.dynamic_flats`.
+            components of the flats are added with the amplitudes that the projection shows, see
+            `recon.prep.dynamic_flats`.
         ring_current: "use": projections and flats are divided by the ring current that the file has for each frame.
         floor, hot_threshold, zinger_threshold: which pixels are replaced with values of their neighbours, see
             `recon.prep.counts_plan.CorrectionSettings`.

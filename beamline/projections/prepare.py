@@ -55,7 +55,7 @@ class DiskBuffer:
 
     Attributes:
         views: float32 [view, row, col], with room for at least `HELD_OUT_VIEWS` more projections than are selected:
-        receives the line integrals.
+            receives the line integrals.
         batch: number of projections that are corrected together.
     """
 

@@ -44,9 +44,9 @@ class PreparedProjections:
 
     Attributes:
         lines: line integrals of all projections; the projections that are used come first. `ids` are rows of the file.
-        `used` is False for held-out projections. `weights` are inverse variances from photon counts; None: photons were
-        not counted. `reach` is measured on the projections used. The geometry is binned, in mm, or in px if the pixel
-        size is unknown.
+            `used` is False for held-out projections. `weights` are inverse variances from photon counts; None: photons
+            were not counted. `reach` is measured on the projections used. The geometry is binned, in mm, or in px if
+            the pixel size is unknown.
         corrected: what the correction changed in the projections used.
         axis_col: rotation axis in columns of the full detector.
         axis: how the axis was found; None if the user gave it.
@@ -55,7 +55,7 @@ class PreparedProjections:
         quantity: quantity of the stored pixels: "counts", which were corrected, or "line_integrals".
         view_weights: float32 [view used], less than 1 for projections with a warning of the monitor; None: 1 for all.
         left_out: projections with an alarm of the monitor, or after a jump of the sample. The selection never includes
-        these.
+            these.
         flags: flags of all frames of the scan; None if the file has no flags.
         measured: bool [row, col], pixels that were measured or could be interpolated well; None: all pixels.
         shares: float32 [view used, row, col], weights of rays in the regions of flags; None: all weights are 1.

@@ -75,7 +75,7 @@ class ViewFilter:
 
     Attributes:
         apply: function of projections and of the detector row at which they begin. Returns the same number of filtered
-        projections; line integrals may be changed in place.
+            projections; line integrals may be changed in place.
         reach: number of binned rows above and below a row that the filter needs.
         mixes: subject and verb of a sentence that says which option mixes neighbouring pixels; for messages.
     """
@@ -184,7 +184,7 @@ class GeometryStep(PrepStep, Protocol):
     Attributes:
         asked_by: the option that asks for it.
         geometry: names of the terms that are to be estimated. With "roll", "tilt" or "shifts", a detector row may show
-        several slices.
+            several slices.
         may_lean: True if the estimated projections may be rolled or tilted.
     """
 

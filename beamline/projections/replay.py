@@ -148,7 +148,7 @@ def replay(
 
     Args:
         follow: clock for waiting for further frames until the file is finished; None: only the frames that are already
-        in the file are checked.
+            in the file are checked.
         should_stop: function that is called before each frame; True ends the replay.
 
     Raises:

@@ -85,7 +85,7 @@ class StepDone:
     Attributes:
         sentence: a sentence for the user; empty if nothing was requested or found.
         parameters: what the file of the volume records about the step, by name; None: the options of the step, and
-        `said`.
+            `said`.
         warned: True if the sentence was already given as a warning.
     """
 

@@ -93,7 +93,7 @@ class UsableViews:
         left_out: projections with an alarm, which are not among `frames`.
         sentence: a sentence that says what was done; empty if no projection is flagged.
         flags: flags of all frames; the other fields follow from them unless flags are ignored. None: the file has no
-        flags.
+            flags.
         regions: regions with less weight, in projections that are used.
         jumps: int64, ascending, rows from which on the sample had another position according to the monitor.
     """

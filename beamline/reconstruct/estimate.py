@@ -78,7 +78,7 @@ def estimate(options: ReconOptions, now: Clock = time.perf_counter) -> Estimate:
 
     Raises:
         DataError: the reconstruction does not fit into the memory or on the disk; the message names the option that
-        would make it fit. A partial volume has another number of slices.
+            would make it fit. A partial volume has another number of slices.
         ConfigError: the selection does not fit the scan, or an option needs more memory than there is. The estimate
             also raises all other errors that the reconstruction raises before it reads a frame.
     """

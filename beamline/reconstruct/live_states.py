@@ -133,7 +133,7 @@ class Feeds:
         fit: the fit; it has used the projections of `batches` and the newest one.
         batches: line integrals of the projections with their final correction.
         newest: the projection after those of `batches`; None: there is no such projection. The fit uses it already, but
-        the projection is corrected again together with the next one.
+            the projection is corrected again together with the next one.
         part: the part of the file whose projections were corrected last.
         history: progress so far, with that of the fits before the axis changed.
         told_behind: True if it was reported that the fit is slower than the scan.
@@ -166,7 +166,7 @@ class LastFit:
 
     Attributes:
         prepared: all projections with the final correction, to which the model was fitted, and the laterally offset
-        projections.
+            projections.
         fit, axis_col, history: see `Feeds`.
     """
 

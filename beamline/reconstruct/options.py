@@ -117,7 +117,7 @@ class ReconOptions:
         method: the method with its settings. `R2.seconds` limits the whole call, or the time after the end of the scan
             if the scan is followed.
         budget: time limit in s from the line integrals to the volume; `auto` does not try methods that would take
-        longer.
+            longer.
         quality: a preset for the number of steps and Gaussians.
         filter: filter of the FBP that the volume is compared with.
         truth: ground truth for the comparison, as FILE or FILE:first:end.

@@ -302,7 +302,7 @@ def reconstruct_file(
 
     Raises:
         ConfigError, DataError: the reconstruction is not possible, or a growing scan stopped without being finished;
-        nothing was written.
+            nothing was written.
         ScanStopped: the user interrupted the reconstruction; it can be continued from the finished slabs.
         KeyboardInterrupt: the user stopped before there was a volume of the running scan.
     """

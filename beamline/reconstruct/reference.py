@@ -42,7 +42,7 @@ def with_reference(
 
     Raises:
         DataError: the file is neither a volume of attenuation nor a scan, a voxel is not finite, or the output and the
-        volume of the reference have the same name.
+            volume of the reference have the same name.
         ScanStopped: the reconstruction of the reference was stopped; its volume was removed.
     """
     if volume_format(path) is None:

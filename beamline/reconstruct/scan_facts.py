@@ -149,9 +149,9 @@ class ScanFacts:
         references: binned mean darks and flats [row, col], by title.
         shape: rows and columns of a frame.
         columns: used columns of the detector, in the form of --cols (the last column is not included); empty: all
-        columns.
+            columns.
         ended: how and why the scan ended before it took all its frames; empty: the scan took all frames or is still
-        running.
+            running.
         frames_per_view: number of frames that are averaged to one projection.
         live_picture: file name of the last picture of a live volume; empty: there was no live volume.
     """

@@ -38,7 +38,7 @@ class CheckedVolume:
     Attributes:
         judgement: comparison of the volume with its projections and with the ground truth.
         volumes: volumes by method: FBP of the same projections, if the volume is compared with FBP, and then the volume
-        itself.
+            itself.
         metrics: figures of merit of each volume, by method.
         warnings: all warnings, those of the context first.
         hiding_warning: the warning that the volume may hide structure; empty if there is none.

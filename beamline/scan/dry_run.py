@@ -188,7 +188,7 @@ def dry_run(
         runs: where the file would be, for the free disk space; default: the configured folder.
         remaining: function that returns the part of the plan that must still be taken.
         whole: energies (keV), or numbers of states, whose scans in the series are already complete; at least one scan
-        must be left.
+            must be left.
         locks: function that returns what is wrong with the file locks in a folder, such as `no_locks`, which writes to
             the folder.
 

@@ -76,7 +76,7 @@ class Commands:
 
     Attributes:
         live: command that runs during the scan. It makes the volume, unless it only `draws` pictures and ends with the
-        scan.
+            scan.
         remark: a remark for the operator; "" if there is none.
     """
 

@@ -75,10 +75,10 @@ class Measurement:
         began: time at which the run began, on the monotonic clock.
         series: the run that is continued; None: a new run.
         source_of: function that makes the object that delivers the frames, if another program controls the scan. None:
-        this program controls the scan with its devices.
+            this program controls the scan with its devices.
         child: function that starts the live reconstruction.
         turn: function that returns when the scan may begin. Its argument `poll` is a function that waits a moment and
-        returns whether Enter was pressed.
+            returns whether Enter was pressed.
         first_state: the scan whose darks and flats are copied; None: this scan takes its own.
     """
 

@@ -61,18 +61,18 @@ def run_scan(
 
     Args:
         runs: folder in which the folder of the run is created; default: the configured folder. Or the run that is
-        continued, with its own configuration.
+            continued, with its own configuration.
         sinks: receive the events, in addition to events.jsonl and user.log in the folder of the run.
         stop: request with which another thread or a signal handler ends the scan.
         live: function that returns the command line of a live reconstruction, or the commands for the scan; None: no
-        live reconstruction.
+            live reconstruction.
         turn: see `Measurement`; None: the scan begins at once.
         instrument: connected devices, which stay open; None: the devices in `config` are opened, and closed at the end.
         ask: function that asks the operator to move the shutter or the sample by hand.
 
     Raises:
         ConfigError: the plan exceeds a limit, or the instrument is not the one with which the run began. Nothing has
-        moved.
+            moved.
         DeviceError, InstrumentError: a device failed. ScanStopped, ScanAborted: a stop or an abort was requested.
         ReferencesError: darks or flats cannot be used; no projection was taken.
         DataError: frames are missing (LedgerError), or the disk failed. In all of these cases the frames taken so far

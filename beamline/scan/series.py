@@ -108,9 +108,9 @@ def run_series(
     Args:
         place: folder in which the folder of the series is created; None: the configured folder.
         stop: request that ends the current scan and with it the series. `sinks`, `ask`: as in `run_scan`, for all
-        scans.
+            scans.
         commands: function that returns the commands for the reconstruction of a scan. If a volume needs the complete
-        scan of a state, it is made after the last state, so that the next state need not wait for it.
+            scan of a state, it is made after the last state, so that the next state need not wait for it.
         series: folder of a series that is continued. Complete scans are kept, and a scan that ended early is continued.
 
     Raises:

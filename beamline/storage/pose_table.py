@@ -55,7 +55,7 @@ class PoseTable:
         by: meaning of `keys`: rows of the scan file, projections counted from 0 in its order, or angles in degrees.
         keys: float64 [row], all different.
         angles_deg: float64 [row], angles of the projections, to be compared with the angles of the scan. None if the
-        file has no angles.
+            file has no angles.
         shifts: float64 [row, 2], displacement of the image along (columns, rows), in `unit`.
         turns_deg: float64 [row, 2], roll and tilt, as in `recon.base.geometry.Geometry`.
         unit: "px" of the unbinned detector, or "mm" at the sample.

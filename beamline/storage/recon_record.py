@@ -63,7 +63,7 @@ class ReconRecord:
 
     Attributes:
         volume: `volume.data` float32 [z, y, x]. For an open file, it is a dataset that can be sliced along z. For a
-        file that was just written, it is read when it is first used.
+            file that was just written, it is read when it is first used.
         length_unit: "mm" if the pixel size is known, otherwise "px".
         raw_file: name of the scan it was made from.
         time: time at which the volume was made, in s since the Unix epoch.
@@ -73,12 +73,12 @@ class ReconRecord:
         deviation: float32 [z, y, x], standard deviation of each voxel, in the unit of the volume; None: not known.
         series: all volumes, if `volume` is one of several; None: it is the only one.
         change: float32 [z, y, x], the volume minus the reference, after the reference was moved to the position of the
-        volume; None: no reference was used.
+            volume; None: no reference was used.
         displacement: float32 [3, z, y, x] along z, y, x in `length_unit`: position of a point in the reference minus
-        its position in the volume; None: no reference was used.
+            its position in the volume; None: no reference was used.
         kind: the quantity of the voxels.
         model: the Gaussians behind the volume and the geometry of their projections (`result.arrays_of_model`); empty:
-        there is no model.
+            there is no model.
         compared: figures of merit of FBP from the same projections; None: not computed. This attribute and the
             following ones exist only for a volume that was just reconstructed; files do not contain them.
         warnings: sentences.

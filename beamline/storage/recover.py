@@ -50,7 +50,7 @@ class Recovered:
         missing: number of projections that were planned or chosen but not taken; None if the file does not contain its
             plan, and for a later part of a run.
         lost: number of frames that were committed but did not reach the disk, and of all frames after them. They are
-        removed.
+            removed.
         damaged: number of frames whose pixels differ from their checksum. They are kept.
         altered: number of frames whose row in the log differs from its checksum. They are kept.
         remark: a step that failed although the frames are complete; "" if no step failed.

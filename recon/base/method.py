@@ -81,7 +81,7 @@ class DataUse(Checked):
             from their neighbours, and gives all other rays the same weight.
         held_out: numbers of the projections that are not fitted; their residual is in the history.
         times: [view] time of each exposure in s, for a method that makes volumes at several times. If `times` is None,
-        the exposures are evenly spaced in time, in the order of the projections.
+            the exposures are evenly spaced in time, in the order of the projections.
         sample_radius: mm from the rotation axis to the edge of a sample that is wider than the field of view; None: it
             is measured.
     """
@@ -105,7 +105,7 @@ class RunControl(Checked):
         on_checkpoint: function that gets the checkpoint of a fit every `checkpoint_every` s.
         resume: checkpoint from which a fit with the same data and settings continues.
         decide: records the decisions that the method derives from its data. If it contains the decisions of an earlier
-        run, the method repeats them. If `decide` is None, the method decides by itself.
+            run, the method repeats them. If `decide` is None, the method decides by itself.
         stop_trials: function that is called after each iteration of the test reconstructions that choose the weight of
             total variation. If `stop_trials` returns True, only the test reconstructions end. None: same as
             `should_stop`.
@@ -234,19 +234,19 @@ class Reconstruction:
         checkpoint: state of a fit for `RunControl.resume`; see `checkpoint.arrays_of`.
         method: name of the method; for `recon.Auto`, of the chosen method. `run` may leave `method` empty for the
         caller to fill in. seconds: wall time of the reconstruction. `run` may leave `seconds` 0 for the caller to fill
-        in.
+            in.
         deviation: standard deviation of each voxel, see `recon.error_bars`; None: not computed.
         series: all volumes of a method that makes several volumes; the first one is also `volume`; None for a method
-        that makes one volume.
+            that makes one volume.
         at: function that returns the volume [z, y, x] at a time (as in `DataUse.times`), or for the number of an
-        energy; None for a method that makes one volume.
+            energy; None for a method that makes one volume.
         chosen: how an automatic choice or a preset found the settings; empty if they were given.
         started_from: number of Gaussians at the start of a fit; 0 for other methods.
         ending: how the run ended. The caller of `run` fills in `ending`.
         outside: function that returns the contribution of the sample outside the volume to the projections of a
             geometry, [view, row, col]; None: no such contribution is known.
         change: the volume minus the reference, after the reference was moved to the position of the volume; None if no
-        reference was used.
+            reference was used.
         displacement: [3, z, y, x] in mm along z, y, x: the position of a point in the reference minus its position in
             the volume; None if no reference was used.
     """

@@ -42,9 +42,9 @@ class CorrectionSettings:
 
     Attributes:
         floor: lowest transmission. A transmission below the floor, including zero and negative values, is replaced by
-        the floor; the line integral is then -log(floor).
+            the floor; the line integral is then -log(floor).
         hot_threshold: limit in robust standard deviations. A pixel is masked if its dark, or its response to the beam,
-        differs from its neighbours by more than `hot_threshold`; with inf, no pixel is masked.
+            differs from its neighbours by more than `hot_threshold`; with inf, no pixel is masked.
         zinger_threshold: limit in standard deviations. A pixel is a zinger if it exceeds both its surroundings and the
             same pixel in the neighbouring projections by this limit, see `recon.prep.spots.spots`; with inf, no zinger
             is removed.

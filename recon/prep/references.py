@@ -35,7 +35,7 @@ class References:
         flats: (position, float32 [row, col]) of each group of flats, or (position, stack). The position is the number
             of the frame in the scan.
         dynamic: components of the differences between flats, from which the flat of each projection is computed; None
-        if the flat of a projection is interpolated between groups of flats.
+            if the flat of a projection is interpolated between groups of flats.
         part_starts: the first frame of each part of the scan, ascending. The flat of a projection is computed from the
             flats of the same part. If this part has no flats, the nearest group of flats is used.
     """

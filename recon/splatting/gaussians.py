@@ -32,7 +32,7 @@ class Gaussians:
         quaternions: [n, 4] (w, x, y, z), rotations; their length need not be 1, but must not be 0.
         raw_densities: [n]; ρ = density_unit * softplus(raw), so a density is never negative.
         density_unit: a typical density in 1/mm. Raw densities describe multiples of this density. Therefore raw
-        densities and their learning rates are the same in any unit of length.
+            densities and their learning rates are the same in any unit of length.
         kernel: radial profile f.
     """
 

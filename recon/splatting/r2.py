@@ -37,12 +37,12 @@ class R2(Fit):
 
     Attributes:
         steps: number of steps; 0: the result is the starting point; None: 400 steps, or, if `seconds` is given, as many
-        steps as the time allows.
+            steps as the time allows.
         seconds: time limit of the whole run by the caller's clock: start, steps, voxel refinement and volume. The
             learning rates decay over this time. If `warm_up` was not called, the compilation of kernels counts, too.
             The fit always makes its start and its first step, even if the time is too short.
         gaussians: number of Gaussians at the start, or the Gaussians to start from; None: a number derived from the
-        detector.
+            detector.
         start: volume from which the first Gaussians are sampled, see `initialise.first_volume`.
         early_stop: stop the fit when the residual in held-out projections no longer falls, and return the model with
             the lowest residual.

@@ -211,13 +211,13 @@ class FitSettings:
         decay: last rate / first rate; in between, the logarithm of the rate falls linearly.
         policy: density control; None: the number of Gaussians stays the same.
         truncation: distance at which Gaussians are cut off. A compact kernel is not cut off, because it has a finite
-        radius.
+            radius.
         smallest: smallest standard deviation in pixels. A thinner Gaussian could lie between the points at which pixels
             are sampled.
         views_per_step: number of projections whose gradients are averaged in a step.
         joined_pixels: factor by which pixels are binned for the fit (not for the voxel refinement). If `joined_pixels`
-        is None, pixels become as wide as the Gaussians, see `initialise.joined_for`; this changes the pixels only in
-        large volumes.
+            is None, pixels become as wide as the Gaussians, see `initialise.joined_for`; this changes the pixels only
+            in large volumes.
         rays: how the integral of a Gaussian along a ray is computed; it matters for cone beams.
         kernel: radial profile of the Gaussians, or its name. A fit that starts from an existing model keeps the kernel
             of that model.

@@ -68,7 +68,7 @@ class Prediction(NamedTuple):
         name: name of the candidate.
         residuals: [held-out view] root mean square, as line integrals; None: the candidate was not tried.
         prior: the prior of the candidate's volume, which is used again for the volume from all projections. None: the
-        candidate has no prior, or chooses it again.
+            candidate has no prior, or chooses it again.
         remark: the reason why the candidate was not tried or was stopped early; may be empty.
     """
 

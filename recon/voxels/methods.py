@@ -47,9 +47,10 @@ class FistaTv(HalfVoxels):
     Attributes:
         iterations: largest number of iterations over all projections.
         tv_weight: threshold of one FISTA step in density units, so that μ = tv_weight x density unit x ||A||². If
-        `tv_weight` is None, μ follows from held-out projections, or from the noise of the data, see `choose_weight`.
+            `tv_weight` is None, μ follows from held-out projections, or from the noise of the data, see
+            `choose_weight`.
         subsets: largest number of subsets into which the first iterations divide the projections. Each subset is one
-        step.
+            step.
         tv_steps: dual steps of total variation in each step.
         still: the volume has converged if four iterations together change it by less than this share of its norm; 0:
             all `iterations` are made.

@@ -65,7 +65,7 @@ class Projector:
     Attributes:
         matched: True if projections are sharpened to the resolution of the measured ones.
         device: device on which loops with this projector compute, see `recon.voxels.devices`; the methods of the
-        projector use the CPU.
+            projector use the CPU.
         sharpened: [view, 2] variance in px² that the sharpening removes along columns and rows; None: no sharpening.
 
     Raises:

@@ -135,8 +135,8 @@ class TrialSettings:
 
     Attributes:
         all_rows: description of the rows if the trial uses all rows (a cone beam whose middle rows show little
-        material). Its pixels may be binned; then its priors are not valid for the volume. Empty: the trial uses some
-        rows.
+            material). Its pixels may be binned; then its priors are not valid for the volume. Empty: the trial uses
+            some rows.
         now: the clock.
         early: True: iterations as in a voxel refinement, which begins with a fit and ends early; False: until volumes
             have converged.
@@ -183,7 +183,7 @@ class Trial:
         unseen: the held-out projections.
         all_columns: the same rows with all columns.
         above: number of rows from the middle of all rows to the middle of the trial's rows. It is 0 for a cone beam,
-        because its rows keep their heights.
+            because its rows keep their heights.
         smooth: the volume of total variation that predicts the held-out projections best so far.
         settings: settings of the run to which the trial belongs.
     """

@@ -100,7 +100,7 @@ class ScanPoses:
     Attributes:
         table: the poses as the file states them.
         shifts: float64 [frame, 2], (col, row) in pixels of the unbinned detector; NaN for a frame without a stated
-        shift.
+            shift.
         roll, tilt: float64 [frame], radians.
         frames: int64 [view], the rows that are used.
         sentence: a sentence that says what was read.

@@ -65,7 +65,7 @@ class TiltAndLens:
 
     Attributes:
         tilt: tilt of the axis in the plane of the detector, in degrees; the column of the axis grows by tan(tilt) per
-        row. "auto": the tilt is measured. None: the tilt is unknown, and projections are used unchanged.
+            row. "auto": the tilt is measured. None: the tilt is unknown, and projections are used unchanged.
         distortion: distortion of the lens; None: no correction.
     """
 

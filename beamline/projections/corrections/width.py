@@ -72,7 +72,7 @@ class Width:
 
     Attributes:
         spread: "none": thin rays. "pixel": the area of the pixel. A number: the area of the pixel, and a Gaussian blur
-        of this many pixels.
+            of this many pixels.
         arc: "auto": the motion that the file states, if it is a pixel or more. "none": the stage stood still during
             exposures. "ARC[:READOUT]": degrees of rotation during an exposure, and from the first detector row to the
             last.

@@ -64,9 +64,9 @@ class ScanSource(ABC):
             not used; NaN: not stated.
         unreadable: rows that `read_known` could not read from the file, each with the reason.
         row_pitch_mm: height of a pixel, measured like `pixel_size_mm`, if it differs from the width; None: pixels are
-        square.
+            square.
         in_order: the frames are in the order of acquisition. False: darks and flats come first in the table, whenever
-        they were taken.
+            they were taken.
         untyped: True if the file does not state whether pixels are integers or real numbers.
         pixel_mask: bool [row, col], pixels that must not be used according to the file; None if the file has no mask.
         frames_per_view: number of camera frames that are averaged to one projection.
@@ -245,7 +245,7 @@ class Opening:
     Attributes:
         follow: the file may still be growing.
         own_angles: True: the angles in the file are used. False: the caller supplies the angles, so the file need not
-        have any.
+            have any.
         one_series: True if the caller states the kind of each frame, so that file names are not used for it.
         counts: True if the caller states that pixels are counts, but gives no darks and flats. The darks and flats may
             then lie next to the projections.
@@ -286,11 +286,11 @@ class ScanFormat:
     Attributes:
         name: name of the format for messages.
         recognises: function that returns whether the file at a path has this format. Formats are asked in the order of
-        the registry. The function may raise DataError for a file of this format that cannot be read, or NotReadyError
-        while following it.
+            the registry. The function may raise DataError for a file of this format that cannot be read, or
+            NotReadyError while following it.
         open: function that opens a path that is recognised.
         at: function that returns the scan to which these arrays of a file belong; None if they are not a scan of this
-        format.
+            format.
         references: function that returns the scan in an open HDF5 file that has frames of one kind (dark or flat); None
             if the file has no such scan.
     """

@@ -35,9 +35,9 @@ class Entry:
 
     Attributes:
         where: path of the field below the entry, or below the root of a Data Exchange file; "detector/" stands for the
-        detector that is read.
+            detector that is read.
         use: how this program uses the field. If `used` is False: why its value changes nothing, or what the user can
-        do.
+            do.
         used: True if this program reads the field.
         units: the known units of a number that is used.
         matters: for a field that is not used: function that returns whether its value may change the volume. None: no

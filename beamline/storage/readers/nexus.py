@@ -185,7 +185,7 @@ class NexusGeometry:
         pixel_mm: (width, height) of a pixel; for a parallel beam at the sample, for a cone beam on the detector.
         cone: mm from the source to the sample and to the detector; None also for a beam that is practically parallel.
         central_ray: (row, column) at which the central ray meets the detector, in the frames as this program reads
-        them; NaN if it is not stated.
+            them; NaN if it is not stated.
         mirrored: whether (rows, columns) of the frames are stored in reverse order.
         turned: rotations of the detector that are not used, as text; "" for none.
         remarks: sentences by name, for `info`.

@@ -54,30 +54,30 @@ class SourceOptions:
         path: HDF5 file (NXtomo, Diamond NeXus, Data Exchange), multi-page TIFF, folder or .zip of images, .npy, Zarr,
             .txrm, the folder of a scene of R²-Gaussian.
         quantity: quantity of the pixels, if the file does not state it. Transmission (0 to 1) becomes counts with flats
-        of 1 and darks of 0.
+            of 1 and darks of 0.
         angles: replace the angles in the file. Give a file in degrees (a text with one angle per line, a table with a
-        column of angles, an .npy), a list with a unit in an HDF5 file (FILE::NAME if there are several), or an array in
-        radians. There is one angle for each projection; or one for each frame, if the order of all frames is known; or
-        one for each number of a series of files, from the first number to the last.
+            column of angles, an .npy), a list with a unit in an HDF5 file (FILE::NAME if there are several), or an
+            array in radians. There is one angle for each projection; or one for each frame, if the order of all frames
+            is known; or one for each number of a series of files, from the first number to the last.
         angle_rows: "a:b", the rows of these angles (or of the angle file next to a TIFF series) that belong to the
-        projections.
+            projections.
         darks, flats: replace the darks and flats in the file. They come before the frames of the file. Give an array,
-        TIFFs, or a separate HDF5 file (FILE::DATASET if it has several datasets).
+            TIFFs, or a separate HDF5 file (FILE::DATASET if it has several datasets).
         data_path: path of the projections [frame, row, col] in an HDF5 file of any layout. In an NXtomo with several
             detectors, path of the frames of one detector.
         darks_path, flats_path: paths of the darks and flats that belong to `data_path`.
         angles_path: path of the angles in any HDF5 file, instead of `angles`.
         angles_unit: "deg" or "rad": unit of the angles from `angles_path` or `angles`. It replaces the unit that the
-        file states.
+            file states.
         order: of the dimensions of the projections, such as "row,view,col" for a stack of sinograms, or "view,col" for
             one sinogram; also for a series of image files.
         earlier: finished files of the same scan; their frames come before those of `path`.
         horizontal_axis: True if the rotation axis is parallel to the rows. Frames are then rotated by 90 degrees.
         frames: "darks=0:5,flats=5:10": the kind of frames, by their rows; all others are projections. Names of files in
-        a folder then do not decide the kind. "0::2" selects every second projection, see `transforms.selected`.
+            a folder then do not decide the kind. "0::2" selects every second projection, see `transforms.selected`.
         then: further files of the same scan, whose frames follow.
         side_file: settings file of the manufacturer, with distances, pixel size, angles and white level; see
-        `side_files`.
+            `side_files`.
         cols: (first, end) columns of the detector; the scan is read as if it had no other columns.
         frames_per_view: number of consecutive frames that are averaged to one projection; None: the number in the plan
             of the file.
@@ -122,7 +122,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
 
     Raises:
         DataError: the file does not exist, has no supported format, or contradicts itself. The message says what was
-        found.
+            found.
         ConfigError: columns lie outside the detector, or the number of frames per projection is less than 1.
         NotReadyError (a DataError, `follow` only): the file does not exist yet or is just being created; try again.
     """

@@ -36,7 +36,7 @@ class MakerKeys:
     Attributes:
         sod, sdd: distances in mm from the source to the rotation axis and to the detector.
         pixel: width of a pixel; its value times `unit` is in mm. It is measured at the sample if `at_sample` is True,
-        otherwise on the detector.
+            otherwise on the detector.
         count: of the projections.
         step, span: angle in degrees between two projections, and of the whole scan.
         first, last: angles in degrees of the first and of the last projection.

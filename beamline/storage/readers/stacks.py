@@ -149,7 +149,7 @@ def open_stacks(
 
     Args:
         data: path of the projections; None: the only array of images. The order of the dimensions may follow the path,
-        as in `/images:view,col,row`. Darks and flats have the same order.
+            as in `/images:view,col,row`. Darks and flats have the same order.
         angles: path of the angles of the projections. Their number helps to decide which dimension counts the
             projections.
 

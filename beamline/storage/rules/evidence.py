@@ -54,7 +54,7 @@ class EvidenceRequest(NamedTuple):
     Attributes:
         accepted: True if the user accepts the darks and flats as they are. Their faults are then only warnings.
         cone: distances in mm from the source to the rotation axis and to the detector, which replace the values in the
-        file.
+            file.
         judge: function that computes flags, which replace the flags in the file; None: the flags in the file are used.
         limits: limits for darks and flats; None: the default limits.
     """

@@ -33,8 +33,8 @@ class FlagPolicy:
     Attributes:
         flags: the flags of all frames that this policy uses.
         views, left_out, halved, masked: bool [frame of the file]: True for, in this order: all projections; projections
-        with an alarm, which are left out; projections with a warning, which have half the weight; projections that are
-        flagged in a region, in which their rays have less weight.
+            with an alarm, which are left out; projections with a warning, which have half the weight; projections that
+            are flagged in a region, in which their rays have less weight.
         jumps: int64, ascending, the first rows after each jump of the sample that the monitor reported.
         parts: the flagged regions of frames: the frame, the region, and whether the flag is an alarm.
     """

@@ -107,7 +107,7 @@ def check_air_level(scan: ScanEvidence, level: float, air: bool, accepted: bool 
 
     Args:
         level: line integral of the air, median over the projections. If there is no air: line integral of the place
-        that absorbs least.
+            that absorbs least.
         air: True if air columns were found and their line integral was subtracted.
         accepted: True if a fault is only a warning.
     """

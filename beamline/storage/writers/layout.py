@@ -144,16 +144,16 @@ class ScanInfo:
     Attributes:
         sample: name of the sample. title: one line for people.
         pixel_size_mm: pixel size at the sample. energy_kev: photon energy. distance_mm: distance from the sample to the
-        detector.
+            detector.
         exposure, period: exposure, and time between triggers, in s.
         axis_col: column of the rotation axis, counted from 0 at the centre of the first column.
         source_distance_mm: distance from the source to the sample; only for a cone beam (`pixel_size_mm` is then the
-        size on the detector, as in NXtomo).
+            size on the detector, as in NXtomo).
         plan, config: the plan as JSON and the configuration as YAML, stored as text.
         devices: the description of each device, by its name.
         filter: name of the filter that is in the beam.
         monochromator_kev: present energy of the monochromator; `energy_kev` is then the same. None: there is no
-        monochromator, or its energy is not known.
+            monochromator, or its energy is not known.
         beam_unit: unit of the readings of the beam monitor; None: there is no beam monitor.
         saturation: counts at which a pixel is saturated.
         offset_views: True if offset projections are planned.

@@ -56,7 +56,7 @@ class MeasuredState:
 
     Attributes:
         at: value of the state on the axis `Series.across`: its charge, the time in h since the first state, or its
-        number.
+            number.
         matches: False if most particles of the reference are missing in the state, so that it is another sample.
     """
 

@@ -94,7 +94,7 @@ class TimedVolumes:
         residual: norm of the residual of the projections, divided by the norm of the projections.
         motion: for each voxel, the displacement to the place from which the voxel takes its value; None: nothing moves.
         unseen_residuals: residuals of coarse volumes in held-out projections, without motion and with motion; None if
-        held-out projections did not decide about motion.
+            held-out projections did not decide about motion.
         smooth: smoothness of the factors (module `proportions`), if each volume is the mean volume multiplied by smooth
             factors; None if each volume is fitted separately.
     """

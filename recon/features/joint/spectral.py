@@ -91,8 +91,8 @@ def fit_materials(
         tv_weight: weight for all components; None: the weights that predict held-out projections best.
         sweeps: number of iterations. An iteration has about nine steps, which use all projections equally often.
         go_on: function called with (iteration, residual) after each iteration. During the test reconstructions for the
-        weights, the first argument is -n, where n is the number of iterations that may still follow (at most
-        `TRIAL_SWEEPS`). If `go_on` returns False, the fit ends with the volumes reached so far.
+            weights, the first argument is -n, where n is the number of iterations that may still follow (at most
+            `TRIAL_SWEEPS`). If `go_on` returns False, the fit ends with the volumes reached so far.
         stop: function called many times within an iteration, from the second step on. If `stop` returns True, the fit
             ends with the volumes from before the current step.
     """

@@ -134,7 +134,7 @@ class Moved:
         particles: the parts of the reference; `first` is the voxel of the reference at voxel 0 of the state.
         u: displacement [3, y, x, z] in voxels, from a voxel of the state to the place from which it takes its value.
         gains: gain of the ground, then of each particle. Voxels next to particles have the median gain of the
-        particles.
+            particles.
         radius: distance from the axis, in voxels, up to which the reference is known.
     """
 

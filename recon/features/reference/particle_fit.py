@@ -80,7 +80,7 @@ class Patch:
     Attributes:
         box: the box of voxels of the state that contains the particle.
         columns: [5, y, x, z], derivatives with respect to the unknowns of the particle. The first one is the particle
-        with a gain of 1.
+            with a gain of 1.
         laplacian: negative Laplacian of the particle.
     """
 

@@ -65,7 +65,7 @@ class ReferenceParticles:
         volume: the whole reference.
         rest: everything that is not a particle.
         owner: number, from 1, of the body to which a voxel belongs; voxels near a particle belong to it, too. 0: no
-        body.
+            body.
         bodies: the particles.
         around: level around each particle.
         grid: grid of the reference, in mm.
@@ -132,7 +132,7 @@ class ParticleFit:
     Attributes:
         estimate: the estimate, with lengths in voxels.
         noise: [body, 6], standard deviations of gain, scale, shift (y, x, z) and mass, from the two halves of the
-        projections.
+            projections.
         seen: [body], share of the body that the used rows show.
         motion: [body, (y, x, z)], shift from the reference in voxels.
     """

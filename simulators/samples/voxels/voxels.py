@@ -67,7 +67,7 @@ class Voxels:
             attenuation: [z, y, x] in 1/mm; the rotation axis goes through the middle.
             spacing: distance between voxels in mm, one value or (z, y, x).
             thresholds: in 1/mm, ascending; a label begins at each. Without thresholds and without `labels`, every voxel
-            above 0 is material.
+                above 0 is material.
             labels: [z, y, x], 0 ... 255; 0 is air.
             names: names of the labels from 1 on; empty: labels are named by their numbers.
 
@@ -225,7 +225,7 @@ class VolumeSettings:
                 apart.
         thresholds: values of the file, ascending, at which the labels 1, 2, ... begin.
         labels: a file of labels 0 ... 255 with the same shape, instead of thresholds; `labels_dataset` is the dataset
-        in it.
+            in it.
         names: names of the labels.
     """
 

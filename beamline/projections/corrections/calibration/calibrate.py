@@ -138,7 +138,7 @@ class Calibrated:
         change: the calibrated change of the geometry, in pixels of the detector, about the middle row of the band.
         pitch: size of such a pixel in mm.
         off_middle: rows from the middle of the band to the middle of the detector, about which projections roll and
-        tilt.
+            tilt.
         pivot: row of the detector about which projections are rolled and tilted, binned and counted from the first
             one used.
         binning: binning of the pixels of the band.

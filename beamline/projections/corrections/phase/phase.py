@@ -57,7 +57,7 @@ class Phase:
         energy_kev: photon energy; None: the value in the file.
         unsharp: (sigma in pixels as they are used, weight), see `recon.features.phase.Paganin`; None: none.
         length: length of the filter that was found from the projections, in pixels as they are used; None: no filter
-        was found, or none was searched for.
+            was found, or none was searched for.
         explanation: what the projections show; empty: they show nothing certain.
     """
 

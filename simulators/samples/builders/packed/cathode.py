@@ -187,11 +187,11 @@ class Cathode(PieceBuilder):
         wall_um: thickness of the wall of the can.
         size_um: median size of the grains, as the diameter of a sphere with the same volume.
         spread: standard deviation of the logarithm of the diameter. The distribution is cut off at 2.5 standard
-        deviations. With a spread of 2, the largest grains are 20 000 times as large as the smallest.
+            deviations. With a spread of 2, the largest grains are 20 000 times as large as the smallest.
         fill: share of the volume between collector and separator that the grains fill, including their pores and
-        cracks. Random packings of balls jam at 0.64.
+            cracks. Random packings of balls jam at 0.64.
         habits: shares of the number of grains with each shape: sphere, ellipsoid, octahedron, truncated_octahedron and
-        plate.
+            plate.
         irregularity: largest relative change of a grain's axes.
         aspect: width over thickness of plates.
         hollow, cracked: shares of the grains that have a hole of half their size, and that have a crack.

@@ -39,11 +39,11 @@ class Cycle:
         states: number of the last state.
         every_s: s from one state to the next; None: the state does not change during a scan.
         growth, spread: mean and standard deviation of the relative change of a particle's volume at charge 1. The
-        contrast of a particle to its surroundings is multiplied by 1/(1 + growth).
+            contrast of a particle to its surroundings is multiplied by 1/(1 + growth).
         inactive: share of particles that do not grow.
         swelling: relative change, at charge 1, of the heights above the lowest particle.
         walk_um, walk_deg: standard deviations of the motion of the whole sample from one state to the next: shift along
-        each axis, and rotation about the rotation axis.
+            each axis, and rotation about the rotation axis.
         cracked: share of particles that crack. A crack begins to open at a charge between 0.5 and 0.9.
         crack_um: least and largest width of cracks at charge 1.
         healing: share of these cracks that close again while the charge falls.
