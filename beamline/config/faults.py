@@ -1,4 +1,4 @@
-"""Faults of the values of a configuration together, each of which is legal alone."""
+"""Faults: finds values of a configuration that are legal alone, but not together."""
 
 from __future__ import annotations
 

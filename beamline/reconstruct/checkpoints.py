@@ -21,7 +21,7 @@ from recon.base.geometry import arrays_of
 from recon.splatting.checkpoint import state_from
 from recon.splatting.optimise import FitState
 
-_SHOWN = 40  # most characters of a value in a message
+_SHOWN = 40  # largest number of characters of a value in a message
 
 
 def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str, Value]) -> dict[str, Value]:
@@ -29,7 +29,7 @@ def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str,
 
     Args:
         prepared: line integrals and geometry; held-out projections have no effect.
-        settings: of the fit, or a method: a dataclass.
+        settings: the settings of the fit, or a method; a dataclass.
         others: seed, start and similar values, by name.
     """
     data = np.ascontiguousarray(prepared.seen.data, np.float32)
@@ -44,7 +44,7 @@ def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str,
 
 
 def differences(now: Mapping[str, Value], before: Mapping[str, Value]) -> list[str]:
-    """The differences between two origins (`made_from`), in words."""
+    """The differences between two origins (see `origin_of`), in words."""
     out = []
     for name in dict.fromkeys([*now, *before]):
         current, stored = now.get(name), before.get(name)
@@ -84,9 +84,8 @@ class CheckpointOptions:
         return self.path is not None or self.resume is not None
 
     def refuse_existing(self) -> None:
-        """Raise DataError before any work if the checkpoint to write exists, or the one to resume from is missing.
-
-        The checkpoint may replace the one that the fit resumes from.
+        """Raise DataError, before any work, in two cases: the checkpoint to write exists, or the checkpoint to resume
+        from is missing. A fit may replace the checkpoint from which it resumes.
         """
         if self.resume is not None:
             _read_state(self.resume)
@@ -97,14 +96,14 @@ class CheckpointOptions:
         """The state to resume from; None if the fit starts from the beginning.
 
         Args:
-            origin: of the fit, see `origin_of`.
+            origin: the origin of the fit, see `origin_of`.
             steps: planned number of steps; 0 if a time limit is planned.
-            warn: function that gets a sentence if the plan differs, because the volume then differs from that of an
-                uninterrupted fit.
+            warn: function that gets a sentence if the planned number of steps differs, because the volume then differs
+                from the volume of an uninterrupted fit.
 
         Raises:
             ConfigError: the fit has already made more steps than planned.
-            DataError: the checkpoint was made from something else.
+            DataError: the checkpoint has another origin.
         """
         if self.resume is None:
             return None
@@ -126,8 +125,9 @@ class CheckpointOptions:
         return kept.state
 
     def write(self, origin: Mapping[str, Value], steps: int, warn: Warn, state: Mapping[str, NDArray[Any]]) -> str:
-        """Write the checkpoint. If the disk refuses, warn, return the reason, and let the fit continue; "" on
-        success."""
+        """Write the checkpoint and return "". If the disk refuses, the fit continues: the function warns and returns
+        the reason.
+        """
         if self.path is None:
             return ""
         try:
@@ -142,13 +142,13 @@ def _read_state(path: Path) -> tuple[Checkpoint, FitState]:
     """The checkpoint, and the state in it.
 
     Raises:
-        DataError: there is no checkpoint, or it holds no state to resume from.
+        DataError: there is no checkpoint, or it does not contain a state to resume from.
     """
     kept = read_checkpoint(path)
     try:
         reached = state_from(kept.state)
         for name, values in kept.state.items():
-            # The last loss and the best of views held out may be NaN; a Gaussian's exponent is infinite.
+            # The last loss, and the best one of the held-out views, may be NaN; a Gaussian's exponent is infinite.
             if name not in ("scalars", "watch", "kernel_exponent") and not np.isfinite(values).all():
                 raise ValueError(f"{name} of the checkpoint has values that are not finite")
         if not (np.isfinite(reached.unit) and reached.unit > 0):

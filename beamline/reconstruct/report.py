@@ -1,4 +1,4 @@
-"""The content of the report of a reconstruction: scan, settings, figures of merit, pictures."""
+"""Report: composes the report of a reconstruction from scan, settings, figures of merit and pictures."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ from recon.voxels.matter_checks import UNEXPLAINED_LIMIT, StrayMass, Unexplained
 from recon.voxels.matter_checks import unexplained as unexplained_by
 from recon.voxels.view_weights import Wedge, unseen_wedges
 
-_MATERIAL = 0.3  # share of the 99th percentile from which a voxel is material
-_SHOWN, _UPRIGHT = 12, 8  # times at most; slices from which on upright cuts of them are drawn, too
+_MATERIAL = 0.3  # a voxel is material if its density exceeds this share of the 99th percentile
+# largest number of times that are shown; number of slices from which on vertical sections of them are drawn, too
+_SHOWN, _UPRIGHT = 12, 8
 _NO_REFERENCE = (
     "Neither volume is the ground truth: if only one of them shows a feature, look for it in the projections."
 )
@@ -73,7 +74,7 @@ def _summary(made: MadeVolume, metrics: Mapping[str, Mapping[str, float]]) -> st
     name, geometry = label_of(result.method), prepared.geometry
     best = "psnr" if truth is not None else "residual"
     own = metrics[result.method]
-    best = best if best in own else "seconds"  # an FBP region has no figure of quality
+    best = best if best in own else "seconds"  # FBP of a region has no figures of quality
     shape, what = " × ".join(str(n) for n in result.volume.grid.shape), f"{name} volume of"
     if result.series is not None:
         seconds = result.series.seconds
@@ -210,7 +211,7 @@ def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mappin
 
 
 def _several(series: VolumeSeries) -> Iterator[Picture]:
-    """Slices of some of several volumes, side by side."""
+    """Slices of some of the volumes of a time series, side by side."""
     n, depth = series.data.shape[:2]
     some = spread(np.arange(n), _SHOWN)
     for title, turned in (("Slices at each time", False), ("Vertical slices at each time", True)):
@@ -243,7 +244,7 @@ def _displaced(result: Reconstruction, moved: Volume) -> str:
 def _doubts(
     result: Reconstruction, prepared: PreparedProjections, unexplained: Unexplained | None
 ) -> Iterator[Picture]:
-    """Pictures of missing angles, error bars, the residual, and the course of the reconstruction."""
+    """Pictures of missing angles, error bars, the residual, and the progress of the reconstruction."""
     unit, kind = prepared.origin.length_unit, VoxelKind.ATTENUATION
     if unseen := unseen_wedges(prepared.geometry):
         yield Picture("Missing wedge", _of_wedges(unseen), pictures.wedges(result.volume, unseen, unit))
@@ -286,7 +287,7 @@ def _doubts(
 
 
 def _views(prepared: PreparedProjections) -> Iterator[Picture]:
-    """Pictures of a corrected projection, a sinogram, the search for the axis, and the poses."""
+    """Pictures of a corrected projection, a sinogram, the search for the rotation axis, and the poses."""
     data, geometry, unit, axis = (
         prepared.seen.data,
         prepared.geometry,

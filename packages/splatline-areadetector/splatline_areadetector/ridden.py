@@ -87,8 +87,8 @@ class RiddenFrames:
         self._sorter = Sorter(plan.blocks, first_id, ride.counters, before, began_within_scan=began_within_scan)
         self._gaps: list[Gap] = []
         self._overflowed: set[int] = set()
-        self._last: ArrayFrame | None = None  # that has a place
-        self._arrived: ArrayFrame | None = None  # the last one
+        self._last: ArrayFrame | None = None  # the last frame that has a place in the plan
+        self._arrived: ArrayFrame | None = None  # the last frame
         self._unplaced: dict[str, list[int]] = {}
         self._unused: dict[str, list[int]] = {}  # for each reason, numbers of frames that arrived and cannot be used
         self._block, self._block_kind, self._in_block = -1, "", 0

@@ -119,11 +119,11 @@ class Sorter:
     ) -> None:  # fmt: skip
         self._planned, self._first_id, self._witness = tuple(blocks), first_id, witness
         self._began_within_scan = began_within_scan
-        self._taken: dict[int, _Taken] = {}  # by the number of the planned block; unplanned blocks follow
+        self._taken: dict[int, _Taken] = {}  # by the number of the planned block; blocks that were not planned follow
         self._now, self._serial, self._step = -1, 0, 0  # step 0: not known yet
-        self._raw = None if before is None else before.number  # the last number as received
+        self._raw = None if before is None else before.number  # the last number as it was received
         self._last_wrap = self._wrapped = (
-            0  # by how much the counter went back at the end of its range: last time, in total
+            0  # how far the counter went back at the end of its range: at the last time, and in total
         )
         self._last = self._known = before
         self._recent = deque[Seen](maxlen=WINDOW)

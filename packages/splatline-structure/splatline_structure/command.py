@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from splatline_structure.volumes import Box, ReadSlices
 
 _FILE = click.Path(path_type=Path)
-FEWEST_VIEWS = 16  # fewest projections that can be divided, 8 in each half
+FEWEST_VIEWS = 16  # fewest projections that can be divided into halves, 8 in each half
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A volume that was read, and what was measured in it.
+    """A volume that was read, and the results of the measurement.
 
     Attributes:
         grid, volume: the grid and the voxels of the box.
@@ -241,7 +241,7 @@ def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: A
         box: the part to measure, also in the volumes from halves of the projections.
 
     Raises:
-        ConfigError: there is no such material. ValueError: no contrast, or the halves have other shapes.
+        ConfigError: there is no such material. ValueError: the volume has no contrast, or the halves have other shapes.
     """
     import numpy as np
 
@@ -298,7 +298,9 @@ def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: A
 
 
 def _parts(path: Path, read: ReadSlices, answer: Answer, **values: Any) -> list[Any]:
-    """The slices of the volume from each half of its projections; empty if not asked for, or if there is no scan."""
+    """The slices of the volumes from each half of the projections. Empty if they were not requested, or if there is no
+    scan.
+    """
     from beamline.storage.volumes.files import opened_volume
     from splatline_structure.volumes import parts_of
 
@@ -308,7 +310,7 @@ def _parts(path: Path, read: ReadSlices, answer: Answer, **values: Any) -> list[
         halves = []
         for half in values["parts"]:
             with opened_volume(half) as opened:
-                holds_all = opened.grid.shape[0] == read.n_slices  # otherwise it holds only these slices
+                holds_all = opened.grid.shape[0] == read.n_slices  # otherwise the file contains only these slices
                 halves.append(opened.volume.data[read.slices if holds_all else slice(None)])
         return halves
     scan = values["scan"] or Path(read.record.raw_file)

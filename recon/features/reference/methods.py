@@ -1,4 +1,4 @@
-"""FromReference: the reconstruction of a state of a sample of which there is a careful scan."""
+"""FromReference: reconstructs a state of a sample with the help of an earlier, careful scan of the same sample."""
 
 from __future__ import annotations
 
@@ -27,24 +27,26 @@ from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import Buffers, VoxelProblem, bytes_of, times_power
 
 _ROUNDS = PLAN[2:]
-_FIRST, _SHARPER, _LAST = 8, 2, 12  # most sweeps of a round; rounds with falling weights, most sweeps of each
+# largest number of iterations of a round; rounds with falling weights, and iterations of each
+_FIRST, _SHARPER, _LAST = 8, 2, 12
 _BUFFERS = Buffers(34.0, 3.0, 4.8, filtered=True)
 
 
 @dataclass(frozen=True, eq=False)
 class FromReference(Method):
-    """A state of a sample, from few projections and an earlier, careful volume of the same sample.
+    """Reconstructs a state of a sample from few projections and an earlier, careful volume of the same sample.
 
-    The reference is moved to the state (a turn, a shift, an affine map, then smooth splines, found from the
-    projections), each of its particles gets a gain, and total variation of the volume and of its difference from the
-    moved reference are kept small; see `recon.features.reference.fit`. Held-out projections decide whether the
-    reference is used. If not, or if there are fewer than 16 projections, the volume is exactly that of `otherwise`.
+    The reference is moved to the state: by a rotation and a shift, then by an affine map, then by smooth splines, which
+    are all found from the projections. Each particle of the reference gets a gain. The fit keeps two total variations
+    small: that of the volume, and that of its difference from the moved reference; see `recon.features.reference.fit`.
+    Held-out projections decide whether the reference is used. If it is not used, or if there are fewer than 16
+    projections, the volume is exactly the volume of the method `otherwise`.
 
     Memory: 34 volumes and 3 times the projections.
 
     Attributes:
-        reference: the earlier volume, in 1/mm, in the frame of its own scan; None: there is none.
-        otherwise: the method if the reference is not used.
+        reference: the earlier volume, in 1/mm, in the coordinates of its own scan; None: there is no reference.
+        otherwise: the method that is used if the reference is not.
     """
 
     name: ClassVar[str] = "from-reference"
@@ -62,12 +64,13 @@ class FromReference(Method):
             require_finite(self.reference)
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        """The volume with its change, or that of `otherwise`; the settings say which of the two, and why.
+        """The volume with its change from the reference, or the volume of `otherwise`. The settings state which of the
+        two it is, and why.
 
         Raises:
-            ValueError: the reference is elsewhere, or no method can use these projections.
+            ValueError: the reference and the volume have no place in common, or no method can use these projections.
         """
-        in_slabs = control.decide is not None  # only slabs share their decisions, and none knows its height
+        in_slabs = control.decide is not None  # only slabs share their decisions, and a slab does not know its height
         decide, trials = control.decide or Decisions(problem.seed), list[Trial | None]()
         control = replace(control, decide=decide)
 
@@ -123,11 +126,11 @@ class FromReference(Method):
         )  # fmt: skip
 
     def preview(self, views: Views) -> Preview | None:
-        """The moved reference plus FBP of what it leaves, on the voxels of these projections, see `preview_of`."""
+        """The moved reference plus FBP of its residual, on the voxels of these projections; see `preview_of`."""
         return None if self.reference is None else preview_of(self.reference, views)
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """As for `otherwise`."""
+        """The same as for `otherwise`."""
         return replace(self, otherwise=self.otherwise.with_quality(quality, default_count))
 
     def toy(self) -> Self:
@@ -138,11 +141,12 @@ class FromReference(Method):
 
 
 class _State:
-    """The iterations from a verdict to the volume; after them, the moved reference and the displacement.
+    """Makes the volume after a verdict. Afterwards it also has the moved reference and the displacement.
 
     Attributes:
         moved: [z, y, x] in 1/mm.
-        displacement: [axis z, y, x; z, y, x] in mm, from where each voxel takes its value of the reference.
+        displacement: [axis z, y, x; z, y, x] in mm, from a voxel to the place in the reference from which it takes its
+            value.
     """
 
     def __init__(self, reference: Volume, verdict: ReferenceVerdict) -> None:
