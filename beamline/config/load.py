@@ -125,7 +125,9 @@ def load_as(model: type[AnySection], path: Path, overrides: Iterable[str] = (), 
         printed_by: the command that prints an example.
     """
     legal = model.model_json_schema()
-    tree = override(_read_file(path, printed_by), overrides, {}, lambda keys: takes_text(keys, legal))
+    tree = _read_file(path, printed_by)
+    _locate(tree.data, path.parent)
+    tree = override(tree, overrides, {}, lambda keys: takes_text(keys, legal))
     try:
         return model.model_validate(tree.data)
     except ValidationError as error:
@@ -354,12 +356,8 @@ def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
             ("scan", "angles", "path"),
             f"scan.angles.path: there is no file {angles.path}; expected a file with the angles in degrees",
         )
-    if config.recon.reference is not None and not Path(config.recon.reference).exists():
-        yield (
-            ("recon", "reference"),
-            f"recon.reference: there is no file {config.recon.reference}; expected a volume of the same sample, or its "
-            "scan",
-        )
+    if (missing := config.recon.missing_reference) is not None:
+        yield ("recon", "reference"), missing
     scene = simulation.scene if simulation is not None else None
     if isinstance(scene, str) and not (shipped / scene).is_file():
         scenes = " | ".join(f"scenes/{path.name}" for path in sorted((shipped / "scenes").glob("*.yaml")))
