@@ -54,7 +54,7 @@ def written(path: Path, scene: Discs, views: int, seed: int) -> Path:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The scans good.h5 and state.h5, and the volume good_volume.h5."""
     folder = tmp_path_factory.mktemp("states")
-    good, _ = written(folder / "good.h5", packed(), 90, 1), written(folder / "state.h5", AFTER, 24, 2)
+    good, _ = written(folder / "good.h5", packed(), 60, 1), written(folder / "state.h5", AFTER, 24, 2)
     done = beamline(
         "recon", str(good), "-m", "fista-tv", *QUICK[:2], "--no-report", "-o", str(folder / "good_volume.h5")
     )
