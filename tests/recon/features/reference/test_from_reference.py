@@ -9,6 +9,7 @@ import pytest
 
 import recon
 from recon.base.arrays import F32
+from recon.base.decisions import Decisions
 from recon.base.method import DataUse, RunControl
 from recon.base.volume import Volume
 from tests.recon.features.reference.scene import LEVEL, ROWS, Discs, N, balls_near_one_end, packed, psnr, scanned
@@ -131,6 +132,17 @@ def test_in_a_cone_the_volume_is_that_of_auto(before: Volume, state: tuple[F32, 
     made = recon.reconstruct(data, cone, recon.FromReference(before, AUTO))
     assert made.settings["reference_because"] == "a reference is used only with a parallel beam, and this is a cone"
     np.testing.assert_array_equal(made.volume.data, recon.reconstruct(data, cone, AUTO).volume.data)
+
+
+@pytest.mark.slow
+def test_a_slab_beyond_the_reference_is_made_by_auto(before: Volume, state: tuple[F32, recon.Geometry]) -> None:
+    """With the decisions of the slab with most material, in which the reference was used."""
+    decide, method = Decisions(), recon.FromReference(before, AUTO)
+    assert recon.reconstruct(*state, method, control=RunControl(decide=decide)).settings["reference_used"]
+    above = method.at_height(3.0 * ROWS + 20)
+    made = recon.reconstruct(*state, above, control=RunControl(decide=Decisions(0, decide.made)))
+    assert made.method in {each.name for each in AUTO.candidates} and made.change is None
+    assert psnr(made.volume.data, STATE.volume) > 15
 
 
 @pytest.mark.slow
