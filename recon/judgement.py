@@ -36,7 +36,7 @@ _REGIONS, _REGION = 2**21, 12  # largest number of voxels in the regions (`metri
 
 
 class Aspect(Flag):
-    """What a volume is judged by, in addition to a ground truth.
+    """The criteria by which a volume is judged, in addition to a ground truth.
 
     RESIDUAL: the residual in up to 16 of the projections used, and in all held-out projections. STRAY: mass where the
     projections show no material. FIT (with RESIDUAL), for a volume fitted to its projections: whether a uniform volume

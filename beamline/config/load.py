@@ -40,13 +40,13 @@ NO_LIVE = ("recon.live=false", "scan.decide=off")
 """Overrides of a run without a reconstruction."""
 
 NO_DECISIONS = "scan.decide {} needs a live reconstruction, and this scan has none, so the scan follows its plan."
-"""Sentence for the operator of such a run, if the scan would otherwise make decisions."""
+"""Message to the operator of a run without a reconstruction, if the scan would otherwise make decisions."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReadConfig:
-    """A configuration in which each single value is legal, the place of each value, and the faults of the values
-    together (place and sentence).
+    """A configuration in which each single value is legal. Also the place of each value, and the faults that concern
+    several values together (place and sentence).
     """
 
     config: Config
@@ -117,7 +117,9 @@ def load_as(model: type[AnySection], path: Path, overrides: Iterable[str] = (), 
         printed_by: the command that prints an example.
     """
     legal = model.model_json_schema()
-    tree = override(_read_file(path, printed_by), overrides, {}, lambda keys: takes_text(keys, legal))
+    tree = _read_file(path, printed_by)
+    _locate(tree.data, path.parent)
+    tree = override(tree, overrides, {}, lambda keys: takes_text(keys, legal))
     try:
         return model.model_validate(tree.data)
     except ValidationError as error:
@@ -156,7 +158,8 @@ def changed(config: Config, overrides: Iterable[str]) -> Config:
 
 
 def each_scan(config: Config) -> tuple[Config, ...]:
-    """The configuration of each scan of a series (`scan.energies`, `scan.states`); that of a single scan itself.
+    """The configuration of each scan of a series (`scan.energies`, `scan.states`). For a single scan, the result
+    contains only its own configuration.
 
     The n-th of N scans begins n / N of an angular step later, or has another random seed. So all scans together contain
     more angles.

@@ -1,4 +1,4 @@
-"""What a configuration plans: angles, blocks of frames, camera settings and the positions of offset projections."""
+"""Planned: angles, blocks of frames, camera settings and offset positions that a configuration plans."""
 
 from __future__ import annotations
 

@@ -66,8 +66,9 @@ class DryRun:
 
     Attributes:
         disk: an existing folder on the disk of the file.
-        needs: of all scans, with the time between states.
-        every: s from the begin of one state to the next; None: another program says when.
+        needs: needs of all scans, including the time between states.
+        every: time in s from the beginning of one state to the beginning of the next; None: another program decides
+            when a state begins.
     """
 
     plan: ScanPlan
@@ -147,7 +148,8 @@ def doubts(config: Config) -> list[str]:
     return [sentence for sentence in dict.fromkeys(sentences) if sentence]
 
 
-_DEMAGNIFIED = 100  # ratio of the pixel size at the sample to that of the camera; no optics demagnifies more
+# ratio of the pixel size at the sample to the pixel size of the camera; no optics demagnifies by more
+_DEMAGNIFIED = 100
 
 
 def _doubt_optics(config: Config) -> str:
@@ -156,7 +158,7 @@ def _doubt_optics(config: Config) -> str:
     """
     optics, camera, own = config.optics, config.devices.camera, 1e3 * PITCH_MM
     settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
-    # mm; half the width of the field of view
+    # half of the width of the field of view, in mm
     half = 5e-4 * optics.pixel_size_um * camera.binning * camera.timing_of(settings).shape[1]
     if optics.pixel_size_um > _DEMAGNIFIED * own:
         return (
@@ -184,14 +186,15 @@ def dry_run(
 
     Args:
         runs: where the file would be, for the free disk space; default: the configured folder.
-        remaining: the part of the plan that is still to be taken.
-        whole: energies (keV) or numbers of states of a series whose scans are already complete; never all of them.
-        locks: function that states what is wrong with the file locks of a folder, such as `no_locks`, which writes
-            there.
+        remaining: function that returns the part of the plan that must still be taken.
+        whole: energies (keV), or numbers of states, whose scans in the series are already complete; at least one scan
+            must be left.
+        locks: function that returns what is wrong with the file locks in a folder, such as `no_locks`, which writes to
+            the folder.
 
     Raises:
-        ConfigError: impossible angles, scene or device settings. Exceeded limits are not an error here: they are the
-            violations of the timeline.
+        ConfigError: angles, scene or device settings are impossible. Exceeded limits do not raise an error here; they
+            are listed as violations of the timeline.
     """
     each = [one for one in each_scan(settings) if (one.scan.state or one.scan.energy) not in whole]
     if settings.scan.energies is not None and len(each) > 1:  # a scene is read at both ends of the energy range
@@ -229,10 +232,11 @@ def _needs(config: Config, timeline: Timeline) -> ScanNeeds:
 
 
 def _requests(config: Config, timeline: Timeline) -> Iterator[OperatorRequest]:
-    """What the scan will ask the operator to do."""
+    """The requests that the scan will make to the operator."""
     by_hand, copied = config.devices.by_hand, _copied(config)
     kinds = [block.kind for block in timeline.blocks if block.n_to_take and block.kind.name not in copied]
-    opened = [None, *(kind is not FrameKind.DARK for kind in kinds), False]  # how it is at first is not known
+    # the position of the shutter at the start is not known
+    opened = [None, *(kind is not FrameKind.DARK for kind in kinds), False]
     moved_out = [False, *(kind is FrameKind.FLAT for kind in kinds if kind is not FrameKind.DARK), False]
     for device, states, request in (
         ("filter", [None, *filter(None, [config.scan.filter])], f"put the filter {config.scan.filter} into the beam"),

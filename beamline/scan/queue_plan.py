@@ -20,8 +20,9 @@ from beamline.scan.dry_run import DryRun
 
 @dataclass(frozen=True)
 class ScanFault:
-    """The reason why a scan cannot run, as a sentence. file, line: place of the value in a file. None: the value is not
-    in a file, or the sentence concerns several lines."""
+    """The reason why a scan cannot run, as a sentence. file, line: place of the value in a file; None if the value is
+    not in a file, or if the sentence is about several lines.
+    """
 
     message: str
     file: str | None = None

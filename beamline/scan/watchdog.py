@@ -36,7 +36,7 @@ from beamline.instrument.connect import shutter_of
 from drivers.base.clock import Clock, SystemClock
 from drivers.stages.shared import FOUND
 
-PATIENCE = 60.0  # s for each step; a stage cannot be opened while it slows down
+PATIENCE = 60.0  # s for each step, because a stage cannot be opened while it slows down
 BETWEEN = 0.5  # s between attempts
 READY_WITHIN = 60.0  # real s
 # real time in s between signs of life; after a watchdog has died, about this time passes until another one runs

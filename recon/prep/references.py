@@ -27,17 +27,17 @@ Kept = TypeVar("Kept", F32, F64)
 class References:
     """Darks (images without beam) and flats (images with beam but without sample).
 
-    A stack of frames [frame, row, col], any real type, is replaced by its mean. Zingers of single frames do not enter
-    the mean.
+    If darks or flats are a stack of frames [frame, row, col] of any real type, the stack is replaced by the mean of its
+    frames. Zingers of single frames do not enter the mean.
 
     Attributes:
         dark: float32 [row, col], mean or median of the darks; or all darks as a stack.
         flats: (position, float32 [row, col]) of each group of flats, or (position, stack). The position is the number
             of the frame in the scan.
-        dynamic: components of the differences between flats, from which the flat of each projection is computed. None:
-            the flat of a projection is interpolated between groups of flats.
+        dynamic: components of the differences between flats, from which the flat of each projection is computed; None
+            if the flat of a projection is interpolated between groups of flats.
         part_starts: the first frame of each part of the scan, ascending. The flat of a projection is computed from the
-            flats of its own part. If its part has no flats, the nearest group of flats is used.
+            flats of the same part. If this part has no flats, the nearest group of flats is used.
     """
 
     dark: Image

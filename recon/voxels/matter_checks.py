@@ -1,4 +1,6 @@
-"""Checks of a volume: mass where projections show no material, structure in the residual, lost weak material."""
+"""Checks of a volume: material in places that the projections show to be empty, structure in the residual, and lost
+weak material.
+"""
 
 from __future__ import annotations
 
@@ -27,15 +29,17 @@ from recon.voxels.view_weights import seen_by
 STRAY_LIMIT = 0.05
 """Share of the mass above which there is a warning, see docs/published.md."""
 
-_VIEWS, _AGREE = 24, 2  # projections examined; number of them that must show a voxel as empty
-# blur in pixels; limit in standard deviations of the blurred noise; and as a share of the 99th percentile
+_VIEWS, _AGREE = 24, 2  # number of examined projections; number of projections that must show a voxel as empty
+# blur in pixels; limit in standard deviations of the blurred noise; limit as a share of the 99th percentile
 _BLUR, _SIGMAS, _LEAST = 1.0, 4.0, 0.005
-_WHOLE = 0.999  # share of the rays of a voxel that pass through air only
-# most voxels examined (at least one slice); most voxels of a volume whose rows do not show slices
+_WHOLE = 0.999  # share of the rays of a voxel that must pass through air only
+# largest number of examined voxels (at least one slice is examined); the same for a volume whose rows do not show
+# slices
 _MOST, _MOST_WHOLE = 2**18, 2**21
 _WORK = 40  # bytes per examined voxel
-_LEAST_AIR = 100  # least number of voxels, or blocks, from which an air level is taken
-_MATTER, _FAINT = 99.5, 0.05  # percentile that is the density unit; share of it above which a density counts
+_LEAST_AIR = 100  # fewest voxels, or blocks, from which an air level is computed
+# percentile that is the density unit; share of the density unit above which a density counts
+_MATTER, _FAINT = 99.5, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +51,8 @@ class StrayMass:
             unit.
         map: float32 [y, x], the highest density along z in these voxels.
         first: number of the first examined slice.
-        air: bool [slice, y, x], those of these voxels that all examined projections see; outside, FBP is meaningless.
+        air: bool [slice, y, x], the empty voxels that all examined projections see. In other empty voxels FBP has no
+            meaning.
     """
 
     share: float
@@ -64,7 +69,8 @@ class StrayMass:
 
 
 def stray_mass(volume: Volume, views: Views) -> StrayMass | None:
-    """Density in voxels that the projections show to be empty; in a large volume, only in slices around its middle.
+    """The mass in voxels that the projections show to be empty. In a large volume, only slices around the middle are
+    examined.
 
     Returns:
         None if no voxel is shown to be empty, the volume contains no material, or it is large and rows do not show
@@ -110,10 +116,11 @@ def _looked_at(geometry: Geometry, grid: Grid) -> int:
 
 
 def seen_empty(views: Views, grid: Grid) -> tuple[Mask, Mask]:
-    """Voxels [z, y, x] that at least two of up to 24 projections show as empty, and voxels that all of these see.
+    """The voxels [z, y, x] that at least two of up to 24 projections show as empty, and the voxels that all these
+    projections see.
 
     A ray crosses no material if its line integral, blurred by a pixel, is within four standard deviations of the noise,
-    or within 0.5 % of the line integrals of the thick parts. So much thinner material counts as air.
+    or within 0.5 % of the line integrals of the thick parts. Thinner material counts as air.
     """
     part = views.select(spread(np.arange(views.geometry.n_views), _VIEWS)).masked()
     data, known = part.data, part.weights
@@ -140,12 +147,13 @@ UNEXPLAINED_LIMIT = 0.007
 round off edges, up to 0.004 in sixteen fits with voxel refinement, and up to 0.005 in true volumes.
 """
 
-_SIGNIFICANT = 4.0  # standard deviations of the noise; above it, the share of noise is below 1e-3
+_SIGNIFICANT = 4.0  # standard deviations of the noise; above it, the share of voxels with noise only is below 1e-3
 _FLIPS = 6
-_SMOOTH, _AROUND = 1.0, 4.0  # pixels: smoothing of the detail, and of the map of the noise
-_ROWS, _COLS = 8, 256  # rows used for this number of columns; fewer for wider detectors
+_SMOOTH, _AROUND = 1.0, 4.0  # pixels: smoothing of the detail, and smoothing of the map of the noise
+_ROWS, _COLS = 8, 256  # number of rows that are used for this number of columns; fewer rows for wider detectors
 _LEAST_VIEWS = 16
-# share of the 99th percentile that is material; voxels of closing, so that cracks belong to the material
+# share of the 99th percentile above which a voxel is material; radius of the closing in voxels, so that cracks belong
+# to the material
 _DENSE, _CLOSED = 0.2, 2
 
 
@@ -168,10 +176,10 @@ class Unexplained:
 def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> RayCheck[Unexplained | None]:
     """Filtered back-projection of the residual p - A x, divided by its noise (measured with random signs).
 
-    With random signs of the projections, structure cancels, because all projections share it, and noise remains [our
-    own; after the odd-even differences of half-sets]. Pixels that make rings are removed first. Up to eight rows around
-    the middle of the material are used, or one row if the detector has 700 columns or more. If the projections move
-    along the axis, the rows that see most of the material are used.
+    If projections get random signs, structure cancels because all projections share it, and noise remains (our own
+    method, after the odd-even differences of half-sets). Pixels that make rings are removed first. Up to eight rows
+    around the middle of the material are used, or one row if the detector has 700 columns or more. If the projections
+    move along the axis, the rows that see most of the material are used.
 
     Args:
         volume: the volume on the slices of the detector rows, 1/mm.
@@ -190,7 +198,7 @@ def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> RayChe
     mass = np.array([np.maximum(image, 0).sum(dtype=np.float64) for image in volume.data])
     middle = round(float(mass @ np.arange(slices) / mass.sum())) if mass.any() else 0
     first = min(max(middle - n // 2, 0), slices - n)
-    if geometry.climbs:  # few projections see the slices in between
+    if geometry.climbs:  # few projections see the slices between the ends
         at = volume.grid.coordinates()[0] / geometry.pixel_pitch + geometry.axis_row
         first = int(np.convolve(mass * seen_by(geometry, at).sum(axis=0), np.ones(n), "valid").argmax())
     rows, _, box = part_of(geometry, volume.grid, slice(first, first + n))
@@ -209,7 +217,9 @@ def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> RayChe
 def _structure(
     shown: Views, model: F32, part: Volume, first: int, matter: Mask, rng: np.random.Generator
 ) -> Unexplained:
-    """See `unexplained`; the part starts at slice `first`, and `model` is its projection [view, row, col]."""
+    """Compute the result of `unexplained` for the slices from `first` on, whose projection is `model` [view, row,
+    col].
+    """
     geometry, box = shown.geometry, part.grid
     unseen = np.broadcast_to(~seen_rays(geometry, box), model.shape)
     if shown.weights is not None:
@@ -252,7 +262,7 @@ def _smoothed(images: F32) -> F32:
 def _fbp_of_each(residual: F32, signs: F32, views: Geometry, box: Grid) -> list[F32]:
     """FBP of the slices of the box, from the residual times each row of signs [kind, view].
 
-    If projections do not move along the axis, all results are slices of one volume, which takes less time.
+    If projections do not move along the axis, all results are computed as slices of one volume, which takes less time.
     """
     rows, cols = views.detector_shape
     kinds = len(signs)
@@ -266,13 +276,13 @@ def _fbp_of_each(residual: F32, signs: F32, views: Geometry, box: Grid) -> list[
     return list(images.reshape(kinds, rows, *images.shape[1:]))
 
 
-_BLOCKS = 96  # most blocks along the longest side of a volume
-_SMOOTHED_BLOCKS, _ABOVE_AIR = 1.5, 5.0  # smoothing in blocks; least density of material, in standard deviations of air
-_MARGIN, _RIM = 4, 0.92  # blocks around matter; share of the radius that all views see
-_LEFT = 0.5  # share of the density in FBP; a block with less has lost its material
-# blocks along z, y and x of the boxes of which a region consists; fewest blocks of a region
+_BLOCKS = 96  # largest number of blocks along the longest side of a volume
+_SMOOTHED_BLOCKS, _ABOVE_AIR = 1.5, 5.0  # smoothing in blocks; least density of material in standard deviations of air
+_MARGIN, _RIM = 4, 0.92  # blocks around material; share of the radius that all projections see
+_LEFT = 0.5  # a block has lost its material if its density is below this share of the density in FBP
+# size along z, y and x, in blocks, of the boxes of which a region consists; fewest blocks of a region
 _CORE, _LEAST_REGION = (3, 5, 5), 64
-_BESIDE = 2  # blocks next to slices without beam, which smoothing mixes with these slices
+_BESIDE = 2  # blocks next to slices without beam; smoothing mixes them with these slices
 
 
 @dataclass(frozen=True)
@@ -281,7 +291,7 @@ class LostMatter:
 
     Attributes:
         region: (z, y, x), each the first voxel and the one after the last.
-        kept: mass in this region divided by the mass in FBP, each relative to its own air level.
+        kept: mass in this region divided by the mass in FBP. Both masses are relative to the air level of their volume.
     """
 
     region: tuple[tuple[int, int], ...]

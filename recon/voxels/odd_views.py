@@ -1,4 +1,4 @@
-"""odd_views: finds projections that differ in a part from the volume made from them, more than their neighbours do."""
+"""odd_views: finds projections in which a part differs from the volume more than in the neighbouring projections."""
 
 from __future__ import annotations
 
@@ -21,18 +21,20 @@ from recon.voxels.projector import projection_images
 LIMIT = 12.0
 """Limit of the score, in standard deviations of the usual differences. Clean real scans stay below 9.4."""
 
-_CELLS = 128  # least number of columns of cells, if the detector has that many pixels
-_BLUR = 4  # pixels; reach of a blur by one pixel
-_BAND, _TOGETHER = 16, 32  # rows of cells that are compared together; projections that are compared together
-_AT_A_TIME = 8  # projections of a cone that are computed together
-_BROAD = 3  # side, in cells, of the area over which a difference is averaged
-# projections on either side that define the usual difference; number of nearest ones that are left out
+_CELLS = 128  # fewest columns of cells, if the detector has that many pixels
+_BLUR = 4  # pixels; range of a blur by one pixel
+# number of rows of cells that are compared together; number of projections that are compared together
+_BAND, _TOGETHER = 16, 32
+_AT_A_TIME = 8  # number of projections of a cone beam that are computed together
+_BROAD = 3  # side of the area, in cells, over which a difference is averaged
+# number of projections on either side that define the usual difference; number of nearest projections that are left out
 _AROUND, _BESIDE = 12, 3
-# least noise of a pixel, as a share of the largest line integral; frames and residuals of fits have no less
+# least noise of a pixel as a share of the largest line integral; frames, and residuals of fits, have at least this
+# noise
 _LEAST_NOISE = 2e-3
-_OUTLIER = 3.0  # largest contribution of one projection, in medians of all
-_SHARP = 0.1  # a volume may miss an edge by this share of what a blur of one pixel changes
-_EXTENT = 0.5  # share of the limit above which a cell belongs to the region
+_OUTLIER = 3.0  # largest contribution of one projection, in units of the median over all projections
+_SHARP = 0.1  # a volume may miss an edge by this share of the change that a blur of one pixel causes
+_EXTENT = 0.5  # a cell belongs to the region if its score exceeds this share of the limit
 _LEAST_VIEWS = 2 * _AROUND + 1
 
 
@@ -59,8 +61,8 @@ def odd_views(grid: Grid, views: Views) -> RayCheck[tuple[OddView, ...]]:
     (light). It averages the difference over 3 x 3 cells, in standard deviations of the projection's noise and finest
     detail. No volume fits its projections perfectly at edges that it blurs, at rings, or outside the field of view. So
     a difference is compared with the same place in the 18 projections at the nearest angles. It is also compared with
-    the edges of the volume in the projection itself, because a face or a crack parallel to the rays is sharp only in a
-    few projections [our own].
+    the edges of the volume in the projection itself, because a face or a crack that is parallel to the rays is sharp
+    only in a few projections (our own method).
 
     Returns:
         The check. Its result is the parts in the order of the projections; empty for fewer than 25 projections.
@@ -83,7 +85,7 @@ def odd_views(grid: Grid, views: Views) -> RayCheck[tuple[OddView, ...]]:
 
 
 def _odd(differences: F32, edges: F32, geometry: Geometry, side: int) -> tuple[OddView, ...]:
-    """The odd projections, by `_differences` of all."""
+    """The odd projections, found in the `_differences` of all projections."""
     n, order, found = geometry.n_views, np.argsort(geometry.angles, kind="stable"), []
     differences, edges = differences[order], edges[order]
     for place in range(n):
@@ -106,7 +108,7 @@ def odd_views_memory(geometry: Geometry) -> int:
     """Approximate memory of `odd_views` in bytes, without projections and volume."""
     views, (rows, cols) = geometry.n_views, geometry.detector_shape
     side, height = _side(geometry), min(_band(geometry), rows)
-    # two bands with their surroundings wait for rows, and the rows that both need are computed and copied
+    # while two bands wait for rows, the rows that both need are computed and copied
     band = (height + 2 * _BLUR) * cols * (cols + 4 * views + 8 * _TOGETHER)
     return 4 * (band + 7 * views * (rows // side) * (cols // side))
 
@@ -127,10 +129,9 @@ def _sharp(models: F32) -> F32:
 
 
 class _Cells(NamedTuple):
-    """Means over cells [view, cell, cell], weighted with the square root of the intensity, 0 in unknown pixels.
-
-    The difference of the projections from the volume, the part of it that edges explain, the known pixels, the
-    projection, the weight, and the difference without weight.
+    """Means over cells [view, cell, cell]. Pixels are weighted with the square root of the intensity; unknown pixels
+    have the weight 0. The means are: the difference of the projections from the volume, the part of the difference that
+    edges explain, the known pixels, the projection, the weight, and the difference without weight.
     """
 
     difference: F32
@@ -142,7 +143,9 @@ class _Cells(NamedTuple):
 
 
 def _fill(cells: _Cells, whole: Views, some: I64, own: slice, around: slice, lines: F32) -> None:
-    """The cells of some projections in their own rows, from the volume's projection in the rows around these."""
+    """Compute the cells of some projections in the rows `own`, from the projection of the volume in these and the
+    neighbouring rows (`around`).
+    """
     side, rows = _side(whole.geometry), slice(own.start - around.start, own.stop - around.start)
     for first in range(0, some.size, _TOGETHER):
         views = slice(int(some[0]) + first, int(some[0]) + min(first + _TOGETHER, some.size))

@@ -1,4 +1,4 @@
-"""The projection of a volume for several checks at once: no ray is computed twice."""
+"""one_projection: projects a volume for several checks at once, so that no ray is computed twice."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from recon.voxels.projector import Projector, volume_lines
 BAND = 16
 """Largest number of detector rows that are computed together, if rows show slices."""
 
-_AT_A_TIME = 8  # projections that are computed together, if rows do not show slices
+_AT_A_TIME = 8  # number of projections that are computed together, if rows do not show slices
 
 Found = TypeVar("Found")
 
@@ -28,8 +28,8 @@ class AskedRays(NamedTuple):
     Attributes:
         views: numbers of the projections, ascending.
         rows: the detector rows.
-        use: function called once with the projection [view, col, row] of the volume in these rays. The projections of
-            other parts may still be incomplete then.
+        use: function called once with the projection [view, col, row] of the volume in these rays. At that time other
+            parts may still be incomplete.
     """
 
     views: I64
@@ -39,17 +39,19 @@ class AskedRays(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RayCheck(Generic[Found]):
-    """A check of a volume by its projections: the rays that it compares, and its result once all were compared."""
+    """A check of a volume by its projections: the rays that it compares, and its result after all rays were
+    compared.
+    """
 
     parts: Sequence[AskedRays]
     result: Callable[[], Found]
 
     def renumbered(self, numbers: I64) -> RayCheck[Found]:
-        """The same check of projections with these ascending numbers, in place of 0, 1, ..."""
+        """The same check, with its projections 0, 1, ... renumbered: `numbers` has the new numbers, ascending."""
         return replace(self, parts=[part._replace(views=numbers[part.views]) for part in self.parts])
 
     def alone(self, volume: Volume, geometry: Geometry) -> Found:
-        """The result of only this check."""
+        """Project the volume for this check alone, and return its result."""
         project_parts(volume, geometry, self.parts)
         return self.result()
 
@@ -102,7 +104,9 @@ class _Waiting:
         self.missing = len(self.part.views) * (self.part.rows.stop - self.part.rows.start)
 
     def complete_with(self, block: _Block) -> bool:
-        """Copies what the block has of this part; True if the part is complete, and used."""
+        """Copy the lines of the block that belong to this part. Returns True if the part is now complete; it has then
+        been used.
+        """
         views, rows, use = self.part
         first, end = max(rows.start, block.rows.start), min(rows.stop, block.rows.stop)
         ours = np.isin(views, block.views) if first < end else np.zeros(len(views), bool)
@@ -123,7 +127,7 @@ class _Waiting:
 
 
 def _blocks(volume: Volume, geometry: Geometry, asked: Mask) -> Iterator[_Block]:
-    """The projection of the rays asked for [row, view], in blocks, ascending."""
+    """The projection of the rays that are asked for [row, view], in blocks in ascending order."""
     if in_bands(geometry, volume.grid):
         for rows in _equal_rows(asked):
             views = np.flatnonzero(asked[rows.start])
@@ -131,7 +135,7 @@ def _blocks(volume: Volume, geometry: Geometry, asked: Mask) -> Iterator[_Block]
             yield _Block(views, rows, Projector(part, grid).forward_lines(volume_lines(volume.data[rows])))
         return
     wanted = np.flatnonzero(asked.any(axis=0))
-    lines = volume_lines(volume.data)  # only once, because for a large volume it takes as long as a projection
+    lines = volume_lines(volume.data)  # computed only once, because for a large volume it takes as long as a projection
     for first in range(0, wanted.size, _AT_A_TIME):
         views = wanted[first : first + _AT_A_TIME]
         projector = Projector(geometry.select(views), volume.grid)
@@ -139,7 +143,7 @@ def _blocks(volume: Volume, geometry: Geometry, asked: Mask) -> Iterator[_Block]
 
 
 def _equal_rows(asked: Mask) -> Iterator[slice]:
-    """Bands of up to 16 rows in which the same projections, at least one, are asked for."""
+    """Bands of up to 16 rows. In all rows of a band the same projections are asked for, at least one."""
     edges = np.flatnonzero((asked[1:] != asked[:-1]).any(axis=1)) + 1
     for first, end in zip([0, *edges.tolist()], [*edges.tolist(), len(asked)], strict=True):
         if asked[first].any():

@@ -20,8 +20,8 @@ from recon.voxels.projector import Projector, projection_lines, volume_lines
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution
 from recon.voxels.voxel_problem import whitened
 
-RAYS = 2**17  # most pixels used of a projection. Bands of rows represent a large detector
-_GROUPS = 4  # groups of projections that are computed one after the other, if rows do not show slices
+RAYS = 2**17  # most pixels of a projection that are used. Bands of rows represent a large detector
+_GROUPS = 4  # number of groups of projections that are computed one after the other, if rows do not show slices
 
 
 class SquaresLeft(NamedTuple):
@@ -46,7 +46,7 @@ class SquaresLeft(NamedTuple):
 
 
 def squares_left(model: F32, views: F32, weight: F32 | None, resolution: ViewResolution) -> SquaresLeft:
-    """Squares of the residual of each projection, at the resolution of voxels.
+    """Sums of the squared residual of each projection, at the resolution of the voxels.
 
     At this resolution the residual of the true volume is only the noise. At the resolution of the measured projections,
     the true volume would have a larger residual than a sharper one.
@@ -62,15 +62,15 @@ def squares_left(model: F32, views: F32, weight: F32 | None, resolution: ViewRes
 
 
 def unseen_residuals(model: F32, views: F32, weight: F32 | None, resolution: ViewResolution) -> F64:
-    """Root mean square [view] of the residuals, see `squares_left`, for projections with a measured ray; [inf] if none
-    has.
+    """[view] root mean square of the residuals (see `squares_left`), for projections with a measured ray; [inf] if no
+    projection has one.
     """
     left, _, rays = squares_left(model, views, weight, resolution)
     return np.sqrt(left[rays > 0] / rays[rays > 0]) if rays.any() else np.full(1, np.inf)
 
 
 def residuals_of(volume: Volume, views: Views) -> F64:
-    """`unseen_residuals` of a volume in these projections."""
+    """The `unseen_residuals` of a volume in these projections."""
     projector = Projector(views.geometry, volume.grid)
     weights = None if views.weights is None else projection_lines(views.weights[...])
     model = projector.forward_lines(volume_lines(volume.data))
@@ -84,7 +84,7 @@ def _summed(left: F32, views: F32, counts: Mask) -> SquaresLeft:
 
 
 class _Compared(NamedTuple):
-    """Rays of some projections that are compared together, and the voxels that explain them."""
+    """Rays of some projections that are compared together, and the voxels through which they pass."""
 
     geometry: Geometry
     grid: Grid
@@ -117,13 +117,13 @@ def residual(grid: Grid, views: Views, most: int) -> RayCheck[tuple[SquaresLeft,
 def uniform_residual(grid: Grid, views: Views, most: int) -> tuple[float, int]:
     """The residual along rows of a volume of uniform density, in the projections that `residual` compares.
 
-    A residual along rows is that of the differences of rays from the mean of their row. The means are left out, because
-    they also contain material outside the field of view, which a correct volume does not contain. The uniform volume is
-    a box or a cylinder that fills the slices, with the best density; the smaller residual counts. A volume with a
-    larger residual shows nothing of the sample yet.
+    A residual along rows is computed after the mean of each row is subtracted, because the mean also contains material
+    outside the field of view, which a correct volume does not contain. The uniform volume is a box or a cylinder that
+    fills the slices, with the best density; the smaller of the two residuals counts. A volume with a larger residual
+    does not show the sample yet.
 
     Returns:
-        The residual, 0 if the rays do not differ from the mean of their row; and the number of projected rays.
+        The residual (0 if the rays do not differ from the mean of their row), and the number of projected rays.
     """
     _, y, x = grid.coordinates()
     inside = (np.hypot(y[:, None], x) < grid.spacing[1] * min(grid.shape[1:]) / 2).astype(np.float32)
@@ -153,7 +153,9 @@ def _compared(grid: Grid, views: Views, most: int) -> Iterator[_Compared]:
 
 
 def _measured(views: Views, part: _Compared) -> tuple[F32, Mask, F32]:
-    """The measured lines [view, col, row], which of them count, and the lines at the resolution of voxels."""
+    """The measured lines [view, col, row], a mask of the lines that count, and the lines at the resolution of
+    voxels.
+    """
     lines = views.data[part.views, part.rows].swapaxes(1, 2)
     counts = np.isfinite(lines)
     if views.weights is not None:

@@ -64,7 +64,9 @@ class MaterialTrial:
     """
 
     def __init__(self, trial: Trial, weight: float, sweeps: int, levels: Sequence[float] | None) -> None:
-        """`weight`: of total variation for all projections. `levels`: in the units of the test, None: found by EM."""
+        """`weight`: weight of total variation for all projections. `levels`: levels in the units of the test; None:
+        found by EM.
+        """
         self._trial, self._sweeps, self._levels = trial, sweeps, levels
         self._weight = weight / math.sqrt(ONE_IN / (ONE_IN - 1))  # see `choose_weight`
         self._start = trial.volume_of_weight(self._weight) if trial.smooth is None else trial.smooth
