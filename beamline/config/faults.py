@@ -34,12 +34,8 @@ def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
             ("scan", "angles", "path"),
             f"scan.angles.path: there is no file {angles.path}; expected a file with the angles in degrees",
         )
-    if config.recon.reference is not None and not Path(config.recon.reference).exists():
-        yield (
-            ("recon", "reference"),
-            f"recon.reference: there is no file {config.recon.reference}; expected a volume of the same sample, or its "
-            "scan",
-        )
+    if (missing := config.recon.missing_reference) is not None:
+        yield ("recon", "reference"), missing
     scene = simulation.scene if simulation is not None else None
     if isinstance(scene, str) and not (shipped / scene).is_file():
         scenes = " | ".join(f"scenes/{path.name}" for path in sorted((shipped / "scenes").glob("*.yaml")))

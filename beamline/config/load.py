@@ -117,7 +117,9 @@ def load_as(model: type[AnySection], path: Path, overrides: Iterable[str] = (), 
         printed_by: the command that prints an example.
     """
     legal = model.model_json_schema()
-    tree = override(_read_file(path, printed_by), overrides, {}, lambda keys: takes_text(keys, legal))
+    tree = _read_file(path, printed_by)
+    _locate(tree.data, path.parent)
+    tree = override(tree, overrides, {}, lambda keys: takes_text(keys, legal))
     try:
         return model.model_validate(tree.data)
     except ValidationError as error:

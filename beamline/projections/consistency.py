@@ -115,7 +115,7 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: ScanSelectio
     if 0 < (whole := prepared.whole_views).size < prepared.geometry.n_views:
         prepared = prepared.of_views(whole)
     geometry = prepared.geometry
-    known = prepared.measured is None and prepared.corrected.floored <= _FLOORED
+    known = prepared.sources.measured is None and prepared.corrected.floored <= _FLOORED
     if geometry.shifts.any() or not geometry.is_straight or whole.size < _LEAST_VIEWS or not known:
         return {}
     conditions = _conditions_of(prepared, whole=selection.asked.rows is None)

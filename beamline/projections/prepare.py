@@ -19,7 +19,7 @@ from beamline.projections.consistency import compare_with_flats, warn_of_inconsi
 from beamline.projections.correction import ScanCorrectionPlan, apply, apply_in_batches, survey, with_filters_of
 from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
-from beamline.projections.prepared import Corrected, PreparedProjections
+from beamline.projections.prepared import Corrected, PreparedProjections, ScanOrigin, WeightSources
 from beamline.projections.protocols import EstimatedStep, ScanStep, ViewStep
 from beamline.projections.read import NoViewError, ViewFilters
 from beamline.projections.registry import geometry_steps, in_order
@@ -123,9 +123,9 @@ def prepare_projections(
             held_out = apply(plan, others, warn=warn)
             room = None if buffer is None else buffer.views
             prepared = prepared.with_held_out(held_out, view_geometry.of(held_out.view_ids), room)
-    prepared = replace(prepared, done={**plan.done, **tilt, **view_geometry.done})
+    prepared = prepared.stating(done={**plan.done, **tilt, **view_geometry.done})
     prepared = with_reach(scan, _after_scan_steps(scan, prepared, phases))  # the steps changed line integrals
-    prepared = replace(prepared, laws={**light, **warn_of_inconsistency(prepared.centred, scan.selection, warn)})
+    prepared = prepared.stating(laws={**light, **warn_of_inconsistency(prepared.centred, scan.selection, warn)})
     return prepared if buffer is None else _with_unknown_filled(prepared)
 
 
@@ -196,8 +196,8 @@ def _corrected(
 
 def _after_scan_steps(scan: SelectedScan, prepared: PreparedProjections, phases: Phases) -> PreparedProjections:
     """The projections after the steps that work on all projections. The steps change line integrals in place."""
-    done, steps = dict(prepared.done), [step for step in in_order(scan.selection) if isinstance(step, ScanStep)]
-    prepared = replace(prepared, done=done)  # each step has access to the results of the steps before it
+    done, steps = dict(prepared.origin.done), [step for step in in_order(scan.selection) if isinstance(step, ScanStep)]
+    prepared = prepared.stating(done=done)  # each step has access to the results of the steps before it
     for n, step in enumerate(steps, 1):
         done[step.name] = step.apply(prepared, scan.source.table.angles[prepared.ids], phases.progress)
         phases.progress(n, len(steps))
@@ -212,10 +212,10 @@ def _with_unknown_filled(prepared: PreparedProjections) -> PreparedProjections:
     seen = seen_rays(geometry, Grid.matching(geometry)) if prepared.leaves_slices else None
     for view in range(len(data)):
         weights = np.ones(geometry.detector_shape, np.float32)
-        if prepared.measured is not None:
-            weights *= prepared.measured
-        if prepared.shares_of is not None:
-            shares = prepared.shares_of(slice(view, view + 1), slice(0, len(weights)))
+        if prepared.sources.measured is not None:
+            weights *= prepared.sources.measured
+        if prepared.sources.shares_of is not None:
+            shares = prepared.sources.shares_of(slice(view, view + 1), slice(0, len(weights)))
             weights *= 1 if shares is None else shares[0]
         if seen is not None:
             weights *= seen[view]
@@ -268,17 +268,21 @@ def assemble(
     prepared = PreparedProjections(
         lines=Views(projections.data, geometry, projections.weights, ids),
         corrected=Corrected.of(projections),
-        axis_col=axis[0],
-        axis=axis[1],
-        n_projections=source.table.views.size,
-        length_unit="px" if selection.pixel_size_mm is None else "mm",
-        quantity=source.quantity,
-        view_weights=usable.weights_of(ids),
-        left_out=usable.left_out,
-        flags=usable.flags,
-        shares=None if on_disk else shares_of(slice(None), slice(0, height)),
-        measured=~unknown if unknown.any() else None,
-        shares_of=shares_of if on_disk and regions.mark(ids) else None,
+        origin=ScanOrigin(
+            axis_col=axis[0],
+            axis=axis[1],
+            n_projections=source.table.views.size,
+            length_unit="px" if selection.pixel_size_mm is None else "mm",
+            quantity=source.quantity,
+            left_out=usable.left_out,
+            flags=usable.flags,
+        ),
+        sources=WeightSources(
+            usable.weights_of(ids),
+            ~unknown if unknown.any() else None,
+            None if on_disk else shares_of(slice(None), slice(0, height)),
+            shares_of if on_disk and regions.mark(ids) else None,
+        ),
         stretch=_stretch(source, geometry, resampled=resampling is not None),
     )
     prepared = with_reach(scan, prepared)
@@ -292,7 +296,7 @@ def with_reach(scan: SelectedScan, prepared: PreparedProjections) -> PreparedPro
     it.
     """
     width = scan.selection.sample_width
-    views = replace(prepared.seen, weights=prepared.shares, reach=None)
+    views = replace(prepared.seen, weights=prepared.sources.shares, reach=None)
     reach = reach_of(views) if width is None else whole_reach(views, width / 2)
     return replace(prepared, lines=replace(prepared.lines, reach=reach))
 

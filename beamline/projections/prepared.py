@@ -39,6 +39,72 @@ class Corrected:
 
 
 @dataclass(frozen=True, eq=False)
+class ScanOrigin:
+    """Where projections come from. Only files, reports and messages state these facts.
+
+    Attributes:
+        axis_col: rotation axis in columns of the full detector.
+        axis: how the axis was found; None if the user gave it.
+        n_projections: number of projections of the scan.
+        length_unit: "mm" or "px".
+        quantity: quantity of the stored pixels: "counts", which were corrected, or "line_integrals".
+        left_out: projections with an alarm of the monitor, or after a jump of the sample. The selection never includes
+            these.
+        flags: flags of all frames of the scan; None if the file has no flags.
+        done: what each step did, by name, in the order of the steps.
+        laws: the residuals of the consistency conditions in words, by name.
+    """
+
+    axis_col: float
+    axis: AxisEstimate | None
+    n_projections: int
+    length_unit: str
+    quantity: str
+    left_out: int = 0
+    flags: FrameFlags | None = None
+    done: Mapping[str, StepDone] = field(default_factory=dict)
+    laws: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class WeightSources:
+    """What lowers the weights of rays, in addition to the noise of counted photons.
+
+    Attributes:
+        of_views: float32 [view used], less than 1 for projections with a warning of the monitor; None: 1 for all.
+        measured: bool [row, col], pixels that were measured or could be interpolated well; None: all pixels.
+        shares: float32 [view used, row, col], weights of rays in the regions of flags; None: all weights are 1.
+        shares_of: function that computes `shares` of some projections and rows on request, if line integrals are on
+            disk; None: use `shares`.
+    """
+
+    of_views: F32 | None = None
+    measured: Mask | None = None
+    shares: F32 | None = None
+    shares_of: Callable[[slice, slice], F32 | None] | None = None
+
+    def views(self, views: I64) -> WeightSources:
+        """Those of only these of the projections used."""
+        return replace(self, of_views=_cut(self.of_views, views), shares=_cut(self.shares, views))
+
+    def rows(self, rows: slice) -> WeightSources:
+        """Those of only these detector rows, with the shares computed."""
+        part = (..., rows, slice(None))
+        shares = _cut(self.shares, part) if self.shares_of is None else self.shares_of(slice(None), rows)
+        return replace(self, measured=_cut(self.measured, part), shares=shares, shares_of=None)
+
+    @property
+    def without_warnings(self) -> WeightSources:
+        """Those without the warnings of the monitor: missing rays have weight 0, all others weight 1."""
+        shares = None if self.shares is None else (self.shares > 0).astype(np.float32)
+        return replace(self, of_views=None, shares=shares, shares_of=None)
+
+
+def _cut(array: NDArray[Any] | None, part: Any) -> Any:
+    return None if array is None else array[part]
+
+
+@dataclass(frozen=True, eq=False)
 class PreparedProjections:
     """Line integrals that are ready for reconstruction, and facts about their origin.
 
@@ -48,43 +114,23 @@ class PreparedProjections:
             were not counted. `reach` is measured on the projections used. The geometry is binned, in mm, or in px if
             the pixel size is unknown.
         corrected: what the correction changed in the projections used.
-        axis_col: rotation axis in columns of the full detector.
-        axis: how the axis was found; None if the user gave it.
-        n_projections: number of projections of the scan.
-        length_unit: "mm" or "px".
-        quantity: quantity of the stored pixels: "counts", which were corrected, or "line_integrals".
-        view_weights: float32 [view used], less than 1 for projections with a warning of the monitor; None: 1 for all.
-        left_out: projections with an alarm of the monitor, or after a jump of the sample. The selection never includes
-            these.
-        flags: flags of all frames of the scan; None if the file has no flags.
-        measured: bool [row, col], pixels that were measured or could be interpolated well; None: all pixels.
-        shares: float32 [view used, row, col], weights of rays in the regions of flags; None: all weights are 1.
-        done: what each step did, by name, in the order of the steps.
-        shares_of: function that computes `shares` of some projections and rows on request, if line integrals are on
-            disk; None: use `shares`.
+        origin: where the projections come from.
+        sources: what lowers the weights of rays.
         times: [view used] time of the exposure of each projection in s; None: the method does not need it.
-        laws: the residuals of the consistency conditions in words, by name.
         stretch: height of a pixel divided by its width. `geometry` has square pixels; the distance between slices is
             larger by this factor.
     """
 
     lines: Views
     corrected: Corrected
-    axis_col: float
-    axis: AxisEstimate | None
-    n_projections: int
-    length_unit: str
-    quantity: str
-    view_weights: NDArray[np.float32] | None = None
-    left_out: int = 0
-    flags: FrameFlags | None = None
-    measured: NDArray[np.bool_] | None = None
-    shares: NDArray[np.float32] | None = None
-    done: Mapping[str, StepDone] = field(default_factory=dict)
-    shares_of: Callable[[slice, slice], NDArray[np.float32] | None] | None = None
+    origin: ScanOrigin
+    sources: WeightSources = WeightSources()
     times: NDArray[np.float64] | None = None
     stretch: float = 1.0
-    laws: Mapping[str, str] = field(default_factory=dict)
+
+    def stating(self, **facts: Any) -> PreparedProjections:
+        """The same projections with these facts about their origin."""
+        return replace(self, origin=replace(self.origin, **facts))
 
     @property
     def views(self) -> Views:
@@ -138,19 +184,14 @@ class PreparedProjections:
     def of_rows(self, rows: slice, geometry: Geometry) -> PreparedProjections:
         """The same projections restricted to the detector rows of `geometry`; line integrals are not copied."""
 
-        def cut(array: NDArray[Any] | None) -> Any:
-            return None if array is None else array[..., rows, :]
-
         whole = self.lines
-        shares = cut(self.shares) if self.shares_of is None else self.shares_of(slice(None), rows)
         part = whole.geometry.rows(rows.start, rows.stop) if whole.held_out.size else geometry
+        weights = _cut(whole.weights, (..., rows, slice(None)))
         return replace(
             self,
-            lines=replace(whole, data=whole.data[:, rows], geometry=part, weights=cut(whole.weights)),
+            lines=replace(whole, data=whole.data[:, rows], geometry=part, weights=weights),
             corrected=replace(self.corrected, masked=self.corrected.masked[rows]),
-            measured=cut(self.measured),
-            shares=shares,
-            shares_of=None,
+            sources=self.sources.rows(rows),
         )
 
     @property
@@ -173,16 +214,9 @@ class PreparedProjections:
     def _of(self, lines: Views, views: I64) -> PreparedProjections:
         """These line integrals. The projections with the numbers `views` are used."""
 
-        def some(array: Any) -> Any:
-            return None if array is None else array[views]
-
+        air = replace(self.corrected, air=self.corrected.air[views])
         return replace(
-            self,
-            lines=lines,
-            corrected=replace(self.corrected, air=self.corrected.air[views]),
-            view_weights=some(self.view_weights),
-            shares=some(self.shares),
-            times=some(self.times),
+            self, lines=lines, corrected=air, sources=self.sources.views(views), times=_cut(self.times, views)
         )
 
     def holding_out(self, held: I64) -> PreparedProjections:
@@ -223,7 +257,7 @@ class PreparedProjections:
         """
         ids, (height, width) = self.ids, self.geometry.detector_shape
         runs = self.corrected.unmeasured
-        known = np.ones((height, width), np.bool_) if self.measured is None else self.measured
+        known = np.ones((height, width), np.bool_) if self.sources.measured is None else self.sources.measured
         # [row, col + 1], number of known pixels to the left of the column
         before = np.pad(np.cumsum(known, axis=1), ((0, 0), (1, 0)))
         _, row, left, right = runs[np.isin(runs[:, 0], ids)].T  # runs of these projections
@@ -243,11 +277,8 @@ class PreparedProjections:
 
     @property
     def without_warnings(self) -> PreparedProjections:
-        """The same projections, but warnings of the monitor are ignored: missing rays have weight 0, all other rays
-        weight 1.
-        """
-        shares = None if self.shares is None else (self.shares > 0).astype(np.float32)
-        return replace(self, view_weights=None, shares=shares, shares_of=None)
+        """The same projections without the warnings of the monitor, see `WeightSources`."""
+        return replace(self, sources=self.sources.without_warnings)
 
     def _ray_factors(self) -> RayWeights | None:
         """Weights of all projections, computed when they are needed; None if all rays have weight 1.
@@ -256,19 +287,19 @@ class PreparedProjections:
         too.
         """
         factors: list[NDArray[np.float32]] = []
-        n, geometry = self.n_used, self.geometry
+        n, geometry, sources = self.n_used, self.geometry, self.sources
         others = len(self.lines.data) - n
-        if self.view_weights is not None:
-            factors.append(_and_ones(self.view_weights, others)[:, None, None])
+        if sources.of_views is not None:
+            factors.append(_and_ones(sources.of_views, others)[:, None, None])
         if (counted := self.lines.weights) is not None:
             factors.append(counted / (used := counted[:n]).mean(where=used > 0))
-        if self.measured is not None:
-            factors.append(self.measured.astype(np.float32)[None])
+        if sources.measured is not None:
+            factors.append(sources.measured.astype(np.float32)[None])
         if self.leaves_slices:
             grid = Grid.matching(geometry)
             factors.append(seen_rays(self.lines.geometry, grid).astype(np.float32))
-        if self.shares is not None:
-            factors.append(_and_ones(self.shares, others))
+        if sources.shares is not None:
+            factors.append(_and_ones(sources.shares, others))
         if not factors:
             return None
         shape = (n + others, *geometry.detector_shape)

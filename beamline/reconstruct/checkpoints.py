@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.storage.recon_record import Value
 from beamline.storage.writers.recon_file import Checkpoint, read_checkpoint, write_checkpoint
 from recon.base.geometry import arrays_of
+from recon.base.volume import Volume
 from recon.splatting.checkpoint import state_from
 from recon.splatting.optimise import FitState
 
@@ -36,10 +37,15 @@ def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str,
     out: dict[str, Value] = {
         "projections": hashlib.sha256(data.data).hexdigest(),
         "n_views": prepared.geometry.n_views,
-        "length_unit": prepared.length_unit,
+        "length_unit": prepared.origin.length_unit,
     }
     out |= arrays_of(prepared.geometry)
-    out |= {f"setting {name}": str(value) for name, value in asdict(settings).items()}
+    volumes = {each.name: of for each in fields(settings) if isinstance(of := getattr(settings, each.name), Volume)}
+    plain = asdict(replace(settings, **dict.fromkeys(volumes)) if volumes else settings)
+    out |= {f"setting {name}": str(value) for name, value in plain.items() if name not in volumes}
+    for name, volume in volumes.items():
+        voxels = np.ascontiguousarray(volume.data, np.float32)
+        out[f"setting {name}"] = f"{volume.grid}, {hashlib.sha256(voxels.data).hexdigest()}"
     return out | {f"setting {name}": value for name, value in others.items()}
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 from beamline.core.errors import DataError
 from beamline.core.events import StateEntered
@@ -74,7 +73,7 @@ def _prepared(live: LiveScan, state: Feeds, scan: SelectedScan, usable: UsableVi
             if done[step.name].sentence:
                 live.tell_done({step.name: done[step.name]})
                 state.fit.replace_views(prepared.centred.with_gaps)
-    return with_reach(scan, replace(prepared, done=done))
+    return with_reach(scan, prepared.stating(done=done))
 
 
 def final_fit(

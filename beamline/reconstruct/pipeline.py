@@ -265,10 +265,8 @@ def _for_method(
         )
     if options.method.stops_early and not prepared.lines.held_out.size:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
-        n = prepared.n_used
-        message = (
-            f"{prepared.n_projections - n} of {prepared.n_projections} projections are held out to decide when to stop"
-        )
+        n, of = prepared.n_used, prepared.origin.n_projections
+        message = f"{of - n} of {of} projections are held out to decide when to stop"
         channels.sink(StateEntered("held_out", message, time=channels.clock.now()))
     options.target.require_room(plan.output, plan.scratch - plan.line_integrals)  # line integrals are stored already
     return prepared
@@ -276,13 +274,13 @@ def _for_method(
 
 def _announce(options: ReconOptions, prepared: PreparedProjections, channels: Channels) -> None:
     """Report the corrections that were applied, then send the event `recon_started`."""
-    sink, clock = channels.sink, channels.clock
-    corrections_done({name: done.sentence for name, done in prepared.done.items() if not done.warned}, sink, clock)
-    views, confident = prepared.geometry, None if prepared.axis is None else prepared.axis.confident
-    more = {"n_projections": prepared.n_projections, "detector": views.detector_shape, "axis_confident": confident}
+    sink, clock, origin = channels.sink, channels.clock, prepared.origin
+    corrections_done({name: done.sentence for name, done in origin.done.items() if not done.warned}, sink, clock)
+    views, confident = prepared.geometry, None if origin.axis is None else origin.axis.confident
+    more = {"n_projections": origin.n_projections, "detector": views.detector_shape, "axis_confident": confident}
     sink(
         ReconStarted(
-            options.source.path, options.method.name, views.n_views, prepared.axis_col, more=more, time=clock.now()
+            options.source.path, options.method.name, views.n_views, origin.axis_col, more=more, time=clock.now()
         )
     )
 

@@ -119,8 +119,8 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
             the sample extends beyond the field of view, or the rays need weights.
     """
     geometry = prepared.geometry
-    method, shares = options.method, prepared.shares
-    differ = not plan.slabs or prepared.views.weights is not None or prepared.shares_of is not None
+    method, shares = options.method, prepared.sources.shares
+    differ = not plan.slabs or prepared.views.weights is not None or prepared.sources.shares_of is not None
     weighted, reach = differ if method.weighs else shares is not None, prepared.lines.reach
     needs = ReconMemory(
         options.method_for(geometry), geometry, 0, weighted, bars=options.uncertainty,
@@ -138,11 +138,12 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
         )
     if plan.slabs or (more and method.volumes == 1 and needs.at_once > plan.allowed):
         return _in_slabs(source, options, needs, plan.allowed)
-    if not geometry.is_cone and prepared.axis is not None and needs.at_once > plan.allowed:
+    axis_col = prepared.origin.axis_col
+    if not geometry.is_cone and prepared.origin.axis is not None and needs.at_once > plan.allowed:
         raise DataError(
-            f"{source.path}: not enough memory. The rotation axis (column {prepared.axis_col:.2f}) is off the detector "
+            f"{source.path}: not enough memory. The rotation axis (column {axis_col:.2f}) is off the detector "
             f"middle, so the volume of the 360° scan needs {size(needs.at_once)}, but {size(plan.allowed)} is allowed. "
-            f"Add --axis {prepared.axis_col:.2f}: the volume is then reconstructed in slabs. Nothing was written."
+            f"Add --axis {axis_col:.2f}: the volume is then reconstructed in slabs. Nothing was written."
         )
     return _plan(options, needs, plan.allowed)
 

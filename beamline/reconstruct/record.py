@@ -121,7 +121,7 @@ def _record(made: MadeVolume, checked: CheckedVolume, now: float) -> tuple[Recon
     volumes = {method: written(volume) for method, volume in checked.volumes.items()}
     record = ReconRecord(
         volume=volumes[result.method],
-        length_unit=prepared.length_unit,
+        length_unit=prepared.origin.length_unit,
         raw_file=str(context.facts.path.resolve()),
         title=_title(result, context),
         sample=context.facts.sample or "not stated",
@@ -181,24 +181,24 @@ def parameters_of(made: MadeVolume) -> dict[str, Value]:
     """All parameters of the volume, by name."""
     result, prepared, context = made.result, made.prepared, made.context
     selection, geometry, facts = context.selection, prepared.geometry, context.facts
-    done, cols = recorded(in_order(selection), prepared.done), geometry.detector_shape[1]
+    done, cols = recorded(in_order(selection), prepared.origin.done), geometry.detector_shape[1]
     parameters: dict[str, Value] = {
         "method": result.method,
-        "axis_col": prepared.axis_col,
-        **_axis_parameters(prepared.axis),
+        "axis_col": prepared.origin.axis_col,
+        **_axis_parameters(prepared.origin.axis),
         "views": selection.views,
         "view_frames": prepared.ids,
         "view_angles_deg": np.degrees(geometry.angles),
         "n_views": geometry.n_views,
-        "n_projections": prepared.n_projections,
-        "views_left_out": prepared.left_out,
+        "n_projections": prepared.origin.n_projections,
+        "views_left_out": prepared.origin.left_out,
         "rows": "all" if selection.rows is None else f"{selection.rows[0]}:{selection.rows[1]}",
         **_region_parameters(context),
         "binning": selection.binning,
         "pixel_pitch": geometry.pixel_pitch,
-        "pixel_pitch_unit": prepared.length_unit,
+        "pixel_pitch_unit": prepared.origin.length_unit,
         **(cone_facts((geometry.sod, geometry.sdd), geometry.pixel_pitch, cols) if geometry.is_cone else {}),
-        "quantity": prepared.quantity,
+        "quantity": prepared.origin.quantity,
         **done,
         **_pose_parameters(geometry),
         "floored_fraction": float(prepared.corrected.floored),
@@ -214,8 +214,8 @@ def parameters_of(made: MadeVolume) -> dict[str, Value]:
     parts = np.unique(prepared.corrected.unmeasured[:, 0]), prepared.unmeasured_rows[0]
     unmeasured = zip(("frames_unmeasured_in_part", "rows_unmeasured"), parts, strict=True)
     parameters |= {name: numbers for name, numbers in unmeasured if numbers.size}
-    if prepared.view_weights is not None:
-        parameters["view_weights"] = prepared.view_weights
+    if prepared.sources.of_views is not None:
+        parameters["view_weights"] = prepared.sources.of_views
     if facts.frames_per_view > 1:
         parameters["frames_per_view"] = facts.frames_per_view
     texts = {"columns": facts.columns, "scan_ended": facts.ended, "recipe": context.recipe}

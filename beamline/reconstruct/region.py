@@ -206,7 +206,7 @@ def box_around_sample(scan: SelectedScan) -> Region:
     # the same warnings are given again when the projections are prepared for the volume
     prepared = prepare_projections(look, lambda warning: None)
     data, geometry = prepared.seen.data, prepared.geometry
-    grid = Grid.matching(selection.geometry(prepared.axis_col, geometry.angles))
+    grid = Grid.matching(selection.geometry(prepared.origin.axis_col, geometry.angles))
     across = grid.shape[2]
     # If material extends to the edges, they do not show air. The limit for air would then be too high in all rows.
     if cut := reach_of(prepared.seen).beyond:

@@ -46,7 +46,7 @@ def compose(
     metrics, judgement = checked.metrics, checked.judgement
     settings = {
         k: as_text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k not in ("command", "recipe")
-    } | {f"law: {name}": left for name, left in prepared.laws.items()}
+    } | {f"law: {name}": left for name, left in prepared.origin.laws.items()}
     return Report(
         title=f"{context.facts.sample or context.facts.name}: {label_of(result.method)}",
         summary=_summary(made, metrics),
@@ -55,7 +55,7 @@ def compose(
         metrics={label_of(method): values for method, values in metrics.items()},
         frames=context.facts.frames,
         flags=[*context.facts.remarks, *context.warnings],
-        done=[each.sentence for each in prepared.done.values() if each.sentence and not each.warned],
+        done=[each.sentence for each in prepared.origin.done.values() if each.sentence and not each.warned],
         pictures=[
             *(_slices(prepared, truth, volumes) if result.series is None else _several(result.series)),
             *_doubts(result, prepared, judgement.unexplained),
@@ -80,7 +80,7 @@ def _summary(made: MadeVolume, metrics: Mapping[str, Mapping[str, float]]) -> st
         seconds = result.series.seconds
         what = f"{len(seconds)} volumes at successive times, {seconds[0]:.4g} to {seconds[-1]:.4g} s, of"
     summary = (
-        f"{what} {shape} voxels from {geometry.n_views} of {prepared.n_projections} projections in "
+        f"{what} {shape} voxels from {geometry.n_views} of {prepared.origin.n_projections} projections in "
         f"{result.seconds:.1f} s; {METRICS[best].label} {formatted(best, own[best])}"
     )
     if BASELINE in metrics and result.method != BASELINE:
@@ -164,7 +164,7 @@ def _further(
             "Stray mass",
             "Maximum projection of the density in voxels that the projections show to be empty. All of it is an "
             "artefact: less is better.",
-            pictures.stray_mass(stray.map, result.volume.grid, prepared.length_unit, VoxelKind.ATTENUATION),
+            pictures.stray_mass(stray.map, result.volume.grid, prepared.origin.length_unit, VoxelKind.ATTENUATION),
         )
     if facts.references:
         yield Picture(
@@ -184,7 +184,7 @@ def _further(
 
 def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mapping[str, Volume]) -> Iterator[Picture]:
     """Pictures of slices of all volumes, and of their differences from the first volume."""
-    unit, kind = prepared.length_unit, VoxelKind.ATTENUATION
+    unit, kind = prepared.origin.length_unit, VoxelKind.ATTENUATION
     shown = {"Ground truth": truth} if truth is not None else {}
     shown |= {label_of(method): volume for method, volume in volumes.items()}
     yield Picture(
@@ -245,7 +245,7 @@ def _doubts(
     result: Reconstruction, prepared: PreparedProjections, unexplained: Unexplained | None
 ) -> Iterator[Picture]:
     """Pictures of missing angles, error bars, the residual, and the progress of the reconstruction."""
-    unit, kind = prepared.length_unit, VoxelKind.ATTENUATION
+    unit, kind = prepared.origin.length_unit, VoxelKind.ATTENUATION
     if unseen := unseen_wedges(prepared.geometry):
         yield Picture("Missing wedge", _of_wedges(unseen), pictures.wedges(result.volume, unseen, unit))
     if result.change is not None:
@@ -288,7 +288,12 @@ def _doubts(
 
 def _views(prepared: PreparedProjections) -> Iterator[Picture]:
     """Pictures of a corrected projection, a sinogram, the search for the rotation axis, and the poses."""
-    data, geometry, unit, axis = prepared.seen.data, prepared.geometry, prepared.length_unit, prepared.axis
+    data, geometry, unit, axis = (
+        prepared.seen.data,
+        prepared.geometry,
+        prepared.origin.length_unit,
+        prepared.origin.axis,
+    )
     yield Picture(
         "Projection",
         f"One corrected projection: the line integral of the {VoxelKind.ATTENUATION.value} along each ray. Air should "

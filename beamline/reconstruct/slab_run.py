@@ -24,7 +24,7 @@ from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.writers.partial_volume import PartialVolume, create_partial, open_partial
 from recon.base.decisions import Decisions
 from recon.base.method import SWEEPS_OF_TRIALS, Ending, Method, Progress, Reconstruction, RunControl
-from recon.base.slabs import Slab, part_of
+from recon.base.slabs import Slab, height_of, part_of
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.voxels.methods import FistaTv
@@ -172,7 +172,8 @@ class _SlabJob:
         in_all = sum(each.slices.stop - each.slices.start for each in self.slabs)
         try:
             height = slab.slices.stop - slab.slices.start
-            return by(method.for_part(height / slices, height / in_all), part, box, control), ""
+            method = method.for_part(height / slices, height / in_all)
+            return by(method.at_height(height_of(rows, self.prepared.geometry)), part, box, control), ""
         except DataError as error:
             # A fit needs material in which to place Gaussians; a slab of air has none. A voxel method does not need
             # material.
@@ -246,7 +247,7 @@ def _record(prepared: PreparedProjections, options: ReconOptions, grid: Grid, no
     path = Path(options.source.path)
     return ReconRecord(
         volume=prepared.stretched(Volume(np.broadcast_to(np.float32(0), grid.shape), grid)),
-        length_unit=prepared.length_unit,
+        length_unit=prepared.origin.length_unit,
         raw_file=str(path.resolve()),
         title=f"Partial reconstruction of {path.name}",
         sample="not stated",

@@ -128,7 +128,7 @@ def _sample_radius(result: Reconstruction, prepared: PreparedProjections) -> str
     if SAMPLE not in result.settings:
         return ""
     radius, low, high, density = (result.settings[name] for name in SampleRadius(1, 1, 1, 1).settings)
-    unit, reach = prepared.length_unit, prepared.geometry.reach
+    unit, reach = prepared.origin.length_unit, prepared.geometry.reach
     known, sure = "as given", ""
     if density == 1:
         known = "assumed, because there are too few projections to measure it"
@@ -255,7 +255,7 @@ def _beside_each_other(
 
 def _lost_material(result: Reconstruction, prepared: PreparedProjections, fbp: Volume) -> str:
     """The warning that weakly absorbing material is missing in the volume, although FBP shows it."""
-    lit, seen = prepared.measured, None  # seen [z]: the detector row of the slice was in the beam
+    lit, seen = prepared.sources.measured, None  # seen [z]: the detector row of the slice was in the beam
     if lit is not None and prepared.geometry.rows_show_slices and fbp.grid.shape[0] == len(lit):
         seen = np.asarray(lit.any(axis=1))
     if (lost := lost_matter(result.volume.data, fbp.data, seen)) is None:

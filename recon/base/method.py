@@ -420,6 +420,10 @@ class Method(Checked, ABC):
         limit."""
         return self
 
+    def at_height(self, above: float) -> Self:
+        """The method for a part of a volume whose z = 0 lies `above` mm over that of the whole volume."""
+        return self
+
     def with_quality(self, quality: Quality, default_count: int) -> Self:
         """The method with the settings of a preset. `default_count` is the default number of Gaussians for the grid."""
         return self

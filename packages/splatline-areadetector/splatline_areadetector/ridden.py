@@ -27,9 +27,10 @@ from drivers.base.frame import Frame, FrameKind
 from splatline_areadetector.arrays import ArrayFrame
 from splatline_areadetector.config import RideConfig
 from splatline_areadetector.counters import Counters, Gap, Silence, loss_sentences
+from splatline_areadetector.frame_places import Basis, Decision, FramePosition, NewEpoch, Outside, Seen, Unknown
 from splatline_areadetector.guides import EXPOSURE, Guide, seconds_of
 from splatline_areadetector.plan import RidePlan
-from splatline_areadetector.sorter import Basis, Decision, FramePosition, NewEpoch, Outside, Seen, Sorter, Unknown
+from splatline_areadetector.sorter import Sorter
 from splatline_areadetector.stream import Died, Disconnected, FrameStream, Overflow, Refused
 
 SLICE = 0.25  # s: longest wait for a frame before the stop request is checked again

@@ -228,7 +228,7 @@ def _fitted(
         raise DataError(
             f"{path}: states are measured only with a parallel beam that is not tilted. Nothing was written."
         )
-    if prepared.length_unit != "mm":
+    if prepared.origin.length_unit != "mm":
         geometry = geometry.scaled(record.grid.voxel_size / geometry.sample_pitch)
     used = prepared.views.masked()
     try:

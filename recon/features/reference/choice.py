@@ -43,7 +43,8 @@ class ReferenceVerdict(NamedTuple):
         used: True if the reference is used. False: the volume is the one that `auto` makes.
         because: the residuals in held-out projections, or the test that failed.
         weight: the weight μ for all projections, in the units of the scan.
-        affine, splines: coefficients of the displacement in mm, for `Basis.affine` and for `Basis.splines`.
+        affine, splines: coefficients of the displacement in mm, for `Basis.affine` and for `Basis.splines`. `affine` is
+            for heights from the middle of the reference, which all slabs of a volume share.
         gains: gain of the ground, and one gain for all particles.
     """
 
@@ -79,6 +80,15 @@ def width_of(problem: VoxelProblem) -> float:
     return 2 * problem.projector.geometry.reach
 
 
+def about_reference(affine: F64, reference: Volume, problem: VoxelProblem, width: float, sign: int = 1) -> F64:
+    """Coefficients of `Basis.affine` for heights from the middle of the reference. With sign -1, the reverse: for
+    heights in the problem."""
+    scale = problem.projector.grid.voxel_size / problem.units.projector(problem.projector, 1).grid.voxel_size
+    c = affine.copy()
+    c[:, 0, 0, 0] += sign * c[:, 0, 0, 1] * 2 * scale * reference.grid.centre[0] / width
+    return c
+
+
 def _at_rows(reference: Volume, trial: Trial) -> Volume:
     """The reference with z measured from the middle of the trial's rows, as in the trial of a parallel beam."""
     z, y, x = reference.grid.centre
@@ -95,7 +105,8 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     problem, mu = trial.problem, trial.weight
     if problem.projector.geometry.is_cone:
         return ReferenceVerdict(False, "a reference is used only with a parallel beam, and this is a cone")
-    moved = not_moved(_at_rows(reference, trial), problem)
+    reference = _at_rows(reference, trial)
+    moved = not_moved(reference, problem)
     if mu is None or moved is None:
         return ReferenceVerdict(
             False, "the reference shows no material here" if mu else "the weights could not be chosen"
@@ -109,9 +120,7 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     beside = np.where(moved.known(), 0, smooth).astype(np.float32)
     moved = affinely_moved(MotionViews.of(problem), moved, affine, beside)
     coefficients, gains = affine.nearest(moved.u) * affine.used, moved.gains[:2].tolist()
-    # with z measured from the middle of all rows, not from the middle of the trial's rows
-    about_all = coefficients.copy()
-    about_all[:, 0, 0, 0] -= coefficients[:, 0, 0, 1] * 2 * trial.above * grid.spacing[0] / width
+    about = about_reference(coefficients, reference, problem, width)
     start = np.where(moved.known(), moved.volume(), smooth).astype(np.float32)
     fit = StateFit(problem, moved, start, _FIRST * mu, width)
     fit.rounds(PLAN)
@@ -138,7 +147,7 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     splines = Basis.splines(grid, width, KNOTS)
     bent = splines.nearest(fit.moved.u - padded(affine.field(coefficients)))
     edge = problem.units.projector(problem.projector, 1).grid.voxel_size
-    mm = [(edge * each).ravel().tolist() for each in (about_all, bent.mean(-1, keepdims=True))]
+    mm = [(edge * each).ravel().tolist() for each in (about, bent.mean(-1, keepdims=True))]
     return ReferenceVerdict(True, told, of_scan, mm[0], mm[1], gains)
 
 

@@ -183,7 +183,8 @@ def _clearly_seen(views: PreparedProjections) -> str:
     from recon.voxels.field_edges import busiest_rows
 
     data, geometry = (ordinary := views.centred).seen.data, ordinary.geometry
-    plain = geometry.is_straight and not geometry.is_cone and not geometry.shifts.any() and views.measured is None
+    plain = geometry.is_straight and not geometry.is_cone and not geometry.shifts.any()
+    plain = plain and views.sources.measured is None
     if not plain or geometry.n_views < _FEWEST or reach_of(ordinary.seen).beyond:
         return ""
     rows = busiest_rows(data, _BUSIEST * _small(geometry)[1])

@@ -121,7 +121,7 @@ class Calibrate:
     ) -> StepDone:
         if not self.terms:
             return StepDone(parameters={})
-        done = [views.done[self.name]] if self.name in views.done else []
+        done = [views.origin.done[self.name]] if self.name in views.origin.done else []
         if GAINS in self.terms:
             done.append(without_learnt_gains(views, progress))
         sentence = " ".join(each.sentence for each in done if each.sentence)
@@ -241,7 +241,7 @@ def without_learnt_gains(views: PreparedProjections, progress: Progress) -> Step
     from recon.features.calibration.gains import NEAR_AXIS, learn_gains
 
     try:
-        learnt = learn_gains(views.seen.data, views.geometry, views.measured, progress)
+        learnt = learn_gains(views.seen.data, views.geometry, views.sources.measured, progress)
     except ValueError as error:
         raise DataError(f"--calibrate gains: {error}. Omit --calibrate gains, or give --rings instead.") from error
     values = {"learnt_gains_held_out_before": learnt.without, "learnt_gains_held_out_after": learnt.left}
