@@ -110,12 +110,12 @@ def _runs(counts: NDArray[np.int64]) -> list[TriggerTrain]:
     """The longest runs of equal differences, one after the other. A single count is a run of length one."""
     steps = np.diff(counts)
     ends = [*(1 + np.flatnonzero(np.diff(steps))).tolist(), steps.size]  # last count of each stretch of equal steps
-    runs, at = list[TriggerTrain](), 0
-    while at < counts.size - 1:
-        end = ends[bisect(ends, at)]
-        runs.append(TriggerTrain(int(counts[at]), int(steps[at]), end - at + 1))
-        at = end + 1
-    return [*runs, TriggerTrain(int(counts[at]), 0, 1)] if at < counts.size else runs
+    runs, first = list[TriggerTrain](), 0
+    while first < counts.size - 1:
+        end = ends[bisect(ends, first)]
+        runs.append(TriggerTrain(int(counts[first]), int(steps[first]), end - first + 1))
+        first = end + 1
+    return [*runs, TriggerTrain(int(counts[first]), 0, 1)] if first < counts.size else runs
 
 
 MOST_PASSES = 100

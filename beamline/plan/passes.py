@@ -80,12 +80,12 @@ def ended_by(decisions: Iterable[Mapping[str, Any]]) -> str:
         decisions: values of the events `next_chosen`, oldest first.
     """
     last = next((each for each in decisions if each.get("choice") == Choice.ENOUGH), {})
-    after, by, why, left = (last.get(name) for name in ("passes", "by", "reason", "dropped"))
+    after, by, why, dropped = (last.get(name) for name in ("passes", "by", "reason", "dropped"))
     chosen = f" by the {by}" if by else ""
     chosen += (
         f": {why}".rstrip(".") if why and by != "operator" else ""
     )  # if the operator decided, the reason only repeats this
-    rest = f" {left} planned frames were not taken." if left else ""
+    rest = f" {dropped} planned frames were not taken." if dropped else ""
     return (
         f"The scan ended after pass {after or last.get('number')}, because `enough` was chosen{chosen}.{rest}"
         if last

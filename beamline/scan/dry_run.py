@@ -141,7 +141,7 @@ def doubts(config: Config) -> list[str]:
     ends = float(np.ptp(theta))
     spans = getattr(config.scan.angles, "span_deg", ends), ends, ends * theta.size / max(theta.size - 1, 1)
     sentences = [
-        *(doubt(".".join(at), value) for at, value in quantities(config.model_dump(exclude={"simulation"}))),
+        *(doubt(".".join(key), value) for key, value in quantities(config.model_dump(exclude={"simulation"}))),
         next(filter(None, map(doubt_span, spans)), ""),
         _doubt_optics(config),
     ]

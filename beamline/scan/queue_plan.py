@@ -111,11 +111,11 @@ class QueuePlan:
 
     def refuse_impossible(self) -> None:
         """Raise ConfigError with all faults of all scans, if there are any. Nothing was started."""
-        found = [_named(scan, fault) for scan in self.scans for fault in scan.faults]
-        if found or self.faults:
+        of_scans = [_named(scan, fault) for scan in self.scans for fault in scan.faults]
+        if of_scans or self.faults:
             bad = count(sum(not scan.valid for scan in self.scans), "scan")
-            what = f"{bad} of {len(self.scans)} cannot run" if found else "the scans do not fit on the disk"
-            lines = [f"\n  {line}" for line in (*found, *map(str, self.faults))]
+            what = f"{bad} of {len(self.scans)} cannot run" if of_scans else "the scans do not fit on the disk"
+            lines = [f"\n  {line}" for line in (*of_scans, *map(str, self.faults))]
             raise ConfigError("".join([f"Nothing was started, because {what}:", *lines]))
 
 

@@ -189,8 +189,8 @@ class _Turns:
                 due = clock.now()
             else:
                 states.enter(states.state, f"{name} begins in {-late:.0f} s")
-            while (left := due - clock.now()) > 0 and not stop.stopping:
-                clock.sleep(min(SLICE, left))
+            while (remaining := due - clock.now()) > 0 and not stop.stopping:
+                clock.sleep(min(SLICE, remaining))
         elif self.last is not None:
             pause.pause(f"{name} waits for its trigger")
         if self.last is not None and pause.reason and not stop.stopping:
@@ -279,9 +279,9 @@ def _tell(event: Event, sinks: Sequence[Sink]) -> None:
 def _after_failure(folder: Path, name: str, of: int, sinks: Sequence[Sink]) -> None:
     """Report how the series can be continued; remove its folder if it contains no scan."""
     if any(path.is_dir() for path in folder.iterdir()):
-        at = f"{name[0].lower()}{name[1:]}"
-        said = f"The series of {of} scans ended at {at}. `beamline scan --resume {folder}` continues it."
-        _tell(Warned(said), sinks)
+        scan = f"{name[0].lower()}{name[1:]}"
+        sentence = f"The series of {of} scans ended at {scan}. `beamline scan --resume {folder}` continues it."
+        _tell(Warned(sentence), sinks)
         return
     (folder / CONFIG).unlink()
     folder.rmdir()

@@ -182,8 +182,9 @@ def _expected(n: F64, beam: F64, extra: F64) -> tuple[F64, F64]:
     """Photons expected in each pixel [row, col], above 0. They are the counts, smoothed everywhere or only where they
     show no detail."""
     mean = _smooth(n, _SIGMA) / np.maximum(_smooth(beam, _SIGMA), 1e-12) * beam
-    left = 1 - 0.75 / (np.pi * _SIGMA**2)  # share of the variance of white noise in n - mean: 1 - 2 / 2πσ² + 1 / 4πσ²
-    variance = _smooth((n - mean) ** 2, _SPREAD) / left
+    # share of the variance of white noise in n - mean: 1 - 2 / 2πσ² + 1 / 4πσ²
+    noise_share = 1 - 0.75 / (np.pi * _SIGMA**2)
+    variance = _smooth((n - mean) ** 2, _SPREAD) / noise_share
     counting = _smooth(n + extra, _SPREAD)
     detail = np.clip(1 - _DETAIL * counting / np.maximum(variance, 1e-12), 0, 1)
     return np.maximum(mean + detail * (n - mean), _FEWEST), np.maximum(mean, _FEWEST)

@@ -183,8 +183,8 @@ def shadowed(transmission: NDArray[np.float32], floor: float = 1e-4) -> Mask:
     block = np.ones((3, 3))
     dark = ndimage.binary_opening(ndimage.binary_closing(np.pad(dark, 2, mode="edge"), block), block)[2:-2, 2:-2]
     left, right = (np.logical_and.accumulate(side, axis=1) for side in (dark, dark[:, ::-1]))
-    found = left | right[:, ::-1]
-    return with_rim(found, bright) | whole[:, None]
+    shadow = left | right[:, ::-1]
+    return with_rim(shadow, bright) | whole[:, None]
 
 
 _NEXT, _OUTER = 5, 3  # number of projections next to flats; number of columns
@@ -265,7 +265,7 @@ def air_light(transmission: F32, left: int, right: int) -> F32:
     changed its shape since the flat.
     """
     views, _, cols = transmission.shape
-    sides = [(side, at) for side, at in (
+    sides = [(side, middle) for side, middle in (
         (transmission[:, :, :left], (left - 1) / 2), (transmission[:, :, cols - right :], cols - (right + 1) / 2),
     ) if side.shape[2]]  # fmt: skip
     if not (sides and views):
@@ -273,6 +273,6 @@ def air_light(transmission: F32, left: int, right: int) -> F32:
     levels = [np.median(side, axis=(1, 2)).astype(np.float32) for side, _ in sides]
     if len(sides) == 1:
         return np.repeat(levels[0][:, None], cols, axis=1)
-    first, last = (at for _, at in sides)
+    first, last = (middle for _, middle in sides)
     along = np.clip((np.arange(cols) - first) / (last - first), 0, 1).astype(np.float32)
     return levels[0][:, None] * (1 - along) + levels[1][:, None] * along
