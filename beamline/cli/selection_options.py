@@ -102,7 +102,8 @@ scan_options = together(
         metavar="KINDS",
         help=(
             "State which frames are darks and flats, for example darks=0:5,flats=5:10+95:100. All others are "
-            "projections. Overrides the file. none=30:38+61:62 leaves these frames out. If you give only none=, the "
+            "projections. This option overrides the file. none=30:38+61:62 leaves these frames out. If you give only "
+            "none=, the "
             "file states the kind of the other frames. 0::2 or 1::2: use every second projection with its darks and "
             "flats, if two exposures or thresholds alternate."
         ),
@@ -274,7 +275,8 @@ _BEFORE = (
         "--cols",
         callback=parsed(span),
         metavar="FIRST:END",
-        help="Detector columns to use, as if the detector had no others: --axis and messages count columns from FIRST. "
+        help="Detector columns to use, as if the detector had only these columns: --axis and messages count columns "
+        "from FIRST. "
         "Default: all.",
     ),
     option(
@@ -283,7 +285,7 @@ _BEFORE = (
         type=WholeRange(min=1),
         default=1,
         show_default=True,
-        help="Average blocks of N x N pixels: less noise, memory and time, voxels N times as large.",
+        help="Average blocks of N x N pixels. This reduces noise, memory and time, and makes voxels N times as large.",
     ),
     option(
         "--axis",

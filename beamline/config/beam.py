@@ -148,11 +148,11 @@ class BeamMonitorSection(Section):
         1.0, "Real time between readings during a scan. The readings are stored in the file of the scan.", gt=0, le=1e6
     )
     pause_below: float | None = setting(
-        None, "In `unit`: the scan pauses if the reading is below this value; null: it never pauses.", gt=0
+        None, "Reading below which the scan pauses, in the unit of the key `unit`; null: the scan never pauses.", gt=0
     )
     resume_above: float | None = setting(
         None,
-        "In `unit`: a paused scan continues when the reading has reached this value again; null: a tenth above "
+        "Reading from which on a paused scan continues, in the unit of the key `unit`; null: a tenth above "
         "pause_below.",
         gt=0,
     )

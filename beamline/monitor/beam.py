@@ -66,7 +66,7 @@ class BeamCheck(Logged):
     meaning: ClassVar[str] = "the beam intensity differs from that in the flats, or from the projections before"
 
     drift: float = setting(0.02, "fraction by which the beam intensity may drift up or down", ge=0)
-    dip: float = setting(0.10, "fraction of the beam intensity whose sudden loss is an alarm", ge=0, lt=1)
+    dip: float = setting(0.10, "sudden loss of beam intensity above which there is an alarm, as a fraction", ge=0, lt=1)
 
     start = BeamState
 

@@ -237,7 +237,7 @@ class LostCheck:
     meaning: ClassVar[str] = "the beam is gone"
     policy: ClassVar[Policy] = Policy.STOP
 
-    alarm: float = setting(0.5, "fraction of the intensity whose loss means that the beam is lost", ge=0.5, le=1)
+    alarm: float = setting(0.5, "loss of intensity from which on the beam counts as lost, as a fraction", ge=0.5, le=1)
 
     start = LostState
 

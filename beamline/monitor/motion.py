@@ -141,7 +141,7 @@ class MotionCheck(Logged):
 
     alarm: float = setting(0.5, "pixels by which the sample may shift between two projections", ge=0)
     steps: float = setting(
-        3.0, "largest difference between the rotation from projection to projection and one step, in steps", ge=0
+        3.0, "largest allowed error of the rotation between two projections in a row, in angular steps", ge=0
     )
     shake: float = setting(0.25, "pixels (standard deviation) by which the sample may shake", ge=0)
 

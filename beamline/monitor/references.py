@@ -78,7 +78,7 @@ class ReferenceLimits:
     light_over_noise: float = setting(
         3.0, "least intensity of a flat, in units of the noise of a pixel in a dark", ge=0
     )
-    light_gone: float = setting(0.5, "fraction of the intensity of the brightest flats that may be missing", gt=0, lt=1)
+    light_gone: float = setting(0.5, "fraction by which a flat may be darker than the brightest flats", gt=0, lt=1)
     uneven: float = setting(0.1, "relative change of the intensity between flats of a group", gt=0)
     unlit: float = setting(0.5, "fraction of the frame that may be without beam in flats", gt=0, le=1)
     light_in_darks: float = setting(

@@ -120,8 +120,8 @@ def _footnotes(
         (
             any("air" in values for values in metrics.values()),
             "Air level: mean of the voxels that the projections show to be empty, divided by the standard deviation of "
-            "FBP there. If the air of FBP is below zero, weakly absorbing material of the other volume is too low by "
-            "the same amount.",
+            "FBP there. If the air of FBP is below zero, the densities of weakly absorbing material in the other "
+            "volume are too low by the same amount.",
         ),
         (
             views_grew(result),
@@ -161,14 +161,14 @@ def _further(
     if stray is not None and stray.share > 0:
         yield Picture(
             "Stray mass",
-            "Maximum projection of the density in voxels that the projections show to be empty. All of it is an "
-            "artefact: less is better.",
+            "Maximum projection of the density in voxels that the projections show to be empty. All density in this "
+            "picture is an artefact: less is better.",
             pictures.stray_mass(stray.map, result.volume.grid, prepared.length_unit, VoxelKind.ATTENUATION),
         )
     if facts.references:
         yield Picture(
             "Darks and flats",
-            "As the camera recorded them. Smooth flats are better: dust makes rings if it moves, or if it is "
+            "Frames as the camera recorded them. Smooth flats are better: dust makes rings if it moves, or if it is "
             "only in the flats. If there are two groups of flats, their ratio should be near one everywhere.",
             reference_sheet(facts.references, facts.shape),
         )
@@ -254,9 +254,9 @@ def _doubts(
             "Change since the reference",
             "A slice of the moved reference, of this volume, and of their difference. Red: denser than before, blue: "
             "less dense. Cracks and pores that opened are blue; at edges, thin pairs of red and blue are errors of the "
-            "motion. Last: FBP of what the moved reference leaves of the projections, blurred by a voxel and divided "
-            "by its standard error. Beyond 4 and -4 the projections themselves show a change."
-            + _displaced(result, moved),
+            "motion. The last picture is FBP of the residual (the measured projections minus those of the moved "
+            "reference), blurred by a voxel and divided by its standard error. Beyond 4 and -4 the projections "
+            "themselves show a change." + _displaced(result, moved),
             pictures.change(result.volume, result.change, left, unit, kind),
         )
     if result.deviation is not None:

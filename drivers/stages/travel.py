@@ -125,7 +125,8 @@ class Travel:
             expected=f"one or more pulses, at least {self.limits.pulse_spacing:g} s apart at full speed, which is "
             f"{least} counts,{multiple} all within {self.span}",
             advice=advice,
-            state="This train is not armed and nothing was sent for it; the stage is where the last move ended",
+            state="Nothing was sent to the stage, and it will send no trigger pulses; the stage is where the last "
+            "move ended",
         )
 
     def refuse_late_arming(self, train: TriggerTrain, counts: int, opening: Fraction | int | None = None) -> None:
@@ -136,13 +137,15 @@ class Travel:
         here = self.degrees(counts)
         if train.interval * (train.start - counts) <= 0:
             problem = f"it is at {here}, at or past the first pulse at {self.degrees(train.start)}"
-            advice = "Move to a position before the first pulse, then arm"
+            advice = "Move to a position before the first pulse, then prepare the trigger pulses again"
         elif opening is not None and train.interval * (opening - counts) <= 0:
             problem = f"it is at {here}, at or past {self.degrees(opening)}, where the pulse output opens"
-            advice = f"Move back by at least {self.degrees(abs(train.interval))}, then arm"
+            advice = f"Move back by at least {self.degrees(abs(train.interval))}, then prepare the trigger pulses again"
         else:
             return
-        raise DeviceRefused(self.name, problem, advice=advice, state="Nothing has moved and this train is not armed")
+        raise DeviceRefused(
+            self.name, problem, advice=advice, state="Nothing has moved, and the stage will send no trigger pulses"
+        )
 
     def refuse_narrower(self, low: int, high: int, advice: str) -> None:
         """Raise DeviceRefused if the controller's own limits (counts) are narrower than those configured."""

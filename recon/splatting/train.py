@@ -73,7 +73,8 @@ class _FitViews:
     def of(cls, method: Fit, problem: ReconProblem) -> _FitViews:
         if problem.geometry.skew and isinstance(method.gaussians, Gaussians):
             raise ValueError(
-                "a fit whose rows have different angles cannot start from given Gaussians; give their number"
+                "a fit whose rows have different angles cannot start from given Gaussians; give a number of "
+                "Gaussians instead"
             )
         if problem.geometry.width and problem.device != "cpu":
             warnings.warn(

@@ -317,7 +317,9 @@ def time_order(source: ScanSource) -> Iterator[Finding]:
     if source.table.times is not None and (back := np.flatnonzero(np.diff(source.table.times) < 0)).size:
         step = np.diff(source.table.times)[back[0]]
         yield Finding(
-            "error", "time-order", f"Time goes back {back.size} times (first: frame {back[0] + 1}, by {-step:.6g} s)."
+            "error",
+            "time-order",
+            f"The times of the frames go back {back.size} times (first: frame {back[0] + 1}, by {-step:.6g} s).",
         )
 
 

@@ -114,7 +114,8 @@ class PiGcsSettings(Wiring, StageFigures):
     axis: str = setting("1", "1 to 16 letters, digits and _", pattern=AXIS_NAME)
     serial: str | None = setting(
         None,
-        "Its serial number, as in *IDN?; the driver stops with an error if another device answers. null: accept any.",
+        "Serial number of the controller, as in *IDN?; the driver stops with an error if another device answers. "
+        "null: accept any.",
     )
     trigger_line: int = setting(1, "Digital output of the trigger pulses.", gt=0)
     reference: Reference = setting(Reference.SWITCH, "Switch at which the search for the reference ends.")
@@ -128,7 +129,10 @@ class PiGcsSettings(Wiring, StageFigures):
         10, "Largest distance from the target at which a move counts as arrived.", unit="counts", ge=0
     )
     settle: float = setting(
-        1.0, "Wait after a move, during which the controller may still settle on the target.", unit="s", ge=0
+        1.0,
+        "Time that the driver waits after a move, because the controller may still settle on the target.",
+        unit="s",
+        ge=0,
     )
 
     def __post_init__(self) -> None:

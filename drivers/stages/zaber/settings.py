@@ -41,7 +41,7 @@ class ZaberSettings(Wiring, StageFigures):
     axis: int = setting(1, ge=1, le=9)
     serial: str | None = setting(
         None,
-        "Its serial number (system.serial); the driver stops with an error if another device answers. "
+        "Serial number of the device (system.serial); the driver stops with an error if another device answers. "
         "null: accept any.",
     )
     output: int = setting(1, "Digital output of the trigger pulses.", gt=0)

@@ -163,7 +163,10 @@ def silence_sentence(counters: Counters) -> str:
     if plugin.text("EnableCallbacks_RBV") == "Disable":
         return f"{plugin.prefix}EnableCallbacks is Disable; set it to Enable"
     if camera is None:
-        return "the camera waits for triggers, or does not acquire (set ride.camera, and the next message says which)"
+        return (
+            "the camera waits for triggers, or does not acquire (if you set ride.camera, this message says which "
+            "of the two)"
+        )
     if camera.text("ArrayCallbacks_RBV") == "Disable":
         return f"{camera.prefix}ArrayCallbacks is Disable; set it to Enable"
     state = camera.text("DetectorState_RBV")

@@ -132,7 +132,8 @@ class Seen:
     type=click.IntRange(0, 20),
     default=1,
     show_default=True,
-    help="Radius, in voxels, of the ball that opens and closes particles; 0: neither.",
+    help="Radius, in voxels, of the ball for the morphological opening and closing of particles; 0: no opening and "
+    "closing.",
 )
 @click.option(
     "--smallest",

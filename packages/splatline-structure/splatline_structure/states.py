@@ -115,7 +115,7 @@ def measure_states(paths: Sequence[Path], output: Path, answer: Answer, values: 
         states.append(MeasuredState(path, x, n_views, numbers_of(reference, fit), fit.matches))
         if not fit.matches:
             answer.warn(
-                f"{path} shows another sample than {first}, or one of which most has changed: less than half of the "
+                f"{path} shows another sample than {first}, or a sample that has mostly changed: less than half of the "
                 "particles of the reference are in it. Its numbers are not determined."
             )
     if not any(state.matches for state in states):
