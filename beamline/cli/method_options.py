@@ -253,7 +253,7 @@ equal_time = option(
     "--seconds",
     excludes={
         "iterations": "give one of them",
-        **dict.fromkeys(("volumes", "spectra"), "it belongs to methods that reconstruct one volume"),
+        **dict.fromkeys(("volumes", "spectra"), "this option belongs to methods that reconstruct a single volume"),
     },
     type=POSITIVE,
     metavar="EACH",

@@ -87,7 +87,7 @@ scan_options = together(
         "--order",
         metavar="DIMENSIONS",
         help="Order of the dimensions of the projections. The default is frame,row,col. Give row,view,col for a stack "
-        "of sinograms, and view,col or col,view for a single sinogram. Also for a series of images.",
+        "of sinograms, and view,col or col,view for a single sinogram. This option also works for a series of images.",
     ),
     option("--darks-path", metavar="DATASET", help="With --data-path: name of the dataset with the darks."),
     option("--flats-path", metavar="DATASET", help="With --data-path: name of the dataset with the flats."),

@@ -149,4 +149,4 @@ def _way_out(origin: str) -> str:
     """What the user can do about a module that is not ours."""
     if not _installed(origin):
         return "rename that file or folder, or work in another folder"
-    return "it belongs to another distribution. Install splatline in a separate environment (python -m venv)"
+    return "this package belongs to another distribution. Install splatline in a separate environment (python -m venv)"

@@ -117,7 +117,8 @@ class OppositeCheck(Logged):
         if view is None or grid is None or state.aside or not math.isfinite(view.angle):
             return CheckResult(state)
         if context.cone or not grid.flats:
-            why = "in a cone beam they differ even if the sample is at rest" if context.cone else "there are no flats"
+            cone = "in a cone beam opposite projections differ even if the sample is at rest"
+            why = cone if context.cone else "there are no flats"
             advice = f"Nothing to do: opposite projections are not compared, because {why}."
             return CheckResult(
                 replace(state, aside=True), Flag(self.name, Level.INFO, frame.index, 0.0, self.warn, advice)

@@ -62,7 +62,7 @@ class RunValues:
     age: float = published("FrameAge", "time since the last frame arrived in the file", math.nan, "s")
     data_rate: float = published("DataRate", "data per second", math.nan, "MB/s")
     residual: float = published("ReconResidual", "projections that the live volume has not used yet", math.nan)
-    skipped: int = published("SkippedLines", "lines of the log that are not events", 0)
+    skipped: int = published("SkippedLines", "messages in the log that are not events", 0)
     angle: float = published("Angle", "of the newest frame in the file", math.nan, "deg")
     flag_names: tuple[str, ...] = published("FlagNames", "checks of the monitor that flagged frames", ())
     flag_counts: tuple[int, ...] = published("FlagCounts", "flags of each check in FlagNames", ())

@@ -131,7 +131,7 @@ def _wrong_shutter(kind: FrameKind, is_open: bool) -> str:
     if is_open is not (kind is FrameKind.DARK):
         return ""
     wanted, actual = ("closed", "open") if kind is FrameKind.DARK else ("open", "closed")
-    return f"it is {actual}, but {kind.name.lower()}s need it {wanted}"
+    return f"the device is {actual}, but for {kind.name.lower()}s it must be {wanted}"
 
 
 def make_safe(

@@ -136,10 +136,10 @@ class Travel:
         """
         here = self.degrees(counts)
         if train.interval * (train.start - counts) <= 0:
-            problem = f"it is at {here}, at or past the first pulse at {self.degrees(train.start)}"
+            problem = f"the stage is at {here}, at or past the first pulse at {self.degrees(train.start)}"
             advice = "Move to a position before the first pulse, then prepare the trigger pulses again"
         elif opening is not None and train.interval * (opening - counts) <= 0:
-            problem = f"it is at {here}, at or past {self.degrees(opening)}, where the pulse output opens"
+            problem = f"the stage is at {here}, at or past {self.degrees(opening)}, where the pulse output opens"
             advice = f"Move back by at least {self.degrees(abs(train.interval))}, then prepare the trigger pulses again"
         else:
             return
@@ -162,19 +162,19 @@ class Travel:
         """The error for a wait that ended after its timeout (s) before the stage had arrived."""
         return DeviceTimeout(
             self.name,
-            f"it is still moving after {timeout:g} s",
+            f"the stage is still moving after {timeout:g} s",
             request=request,
             reply=reply,
             expected=f"to be at {aim}" if aim else "",
             advice="Allow more time, or stop it",
-            state=f"It was left moving, and is at {self.degrees(counts)}",
+            state=f"The stage was left moving, and is at {self.degrees(counts)}",
         )
 
     def not_stopped(self, timeout: float, counts: int, request: str) -> DeviceTimeout:
         """The error for a stop if the stage has not stopped within `timeout` s."""
         return DeviceTimeout(
             self.name,
-            f"it is still moving {timeout:.1f} s after the stop command",
+            f"the stage is still moving {timeout:.1f} s after the stop command",
             request=request,
             advice="Abort, or use the emergency stop",
             state=f"It is moving, at {self.degrees(counts)}",

@@ -78,7 +78,7 @@ class _FitViews:
             )
         if problem.geometry.width and problem.device != "cpu":
             warnings.warn(
-                f"on {problem.device} the Gaussian fit ignores the width of the rays; only its voxel refinement takes "
+                f"on {problem.device} the Gaussian fit ignores the width of the rays; only the voxel refinement takes "
                 f"{problem.geometry.width} into account",
                 stacklevel=3,
             )

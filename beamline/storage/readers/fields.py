@@ -65,7 +65,7 @@ def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
         if not field.used:
             doubt = field.matters is not None and field.matters(value, item, source)
         elif value.size not in (1, frames, views.size):
-            why = f"it has {value.size} values, and the scan {frames} frames"
+            why = f"the field has {value.size} values, but the scan has {frames} frames"
         else:
             varying, share = _varying(field, item, source)
             why = _unit_problem(field, value, item, source) or varying
@@ -81,7 +81,7 @@ def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source:
     if field.units is None or not stated or datasets.in_units(item, field.units) is not None:
         return ""
     if value.dtype.kind not in "uifb":
-        return "it is text; expected a number, with a known unit after it or in its attribute `units`"
+        return "the field is text; expected a number, with a known unit after the number or in the attribute `units`"
     unit = datasets.attribute(item, "units")
     return f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
 
@@ -144,7 +144,8 @@ def _disagrees(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> b
 
 
 _ONE = (
-    "it differs between projections, but one value is used for all of them. Images differ in size by up to {:.2g} px "
+    "the value differs between projections, but one value is used for all projections. Images differ in size by up "
+    "to {:.2g} px "
     "at the edge of the field of view. Scale the images about the rotation axis to one pixel size, or state the right "
     "one with --pixel-size-um (cone beam: --cone)"
 )

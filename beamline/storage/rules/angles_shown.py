@@ -252,7 +252,7 @@ def _angles_finding(scan: ScanEvidence, degrees: NDArray[np.float64], turn: _Tur
     known = [factor for factor in _FACTORS if abs(turn.degrees - 180 * factor) < np.ptp(degrees) / VIEWS]
     counted = np.allclose(degrees, np.arange(degrees.size))
     if counted:
-        unit = "they are 0, 1, 2 and so on, so they are frame numbers"
+        unit = "the values are 0, 1, 2 and so on, so they are frame numbers"
     else:
         unit = f"they look {180 / turn.degrees:.3g} times as large as stated"
     pairs = (

@@ -306,7 +306,7 @@ class NXtomoWriter:
         if now.st_nlink == 0 < self._before.st_nlink:  # if there are links at all
             raise _TouchedError(errno.ENOENT, "it was deleted")
         if now.st_size < self._before.st_size:
-            raise _TouchedError(errno.EIO, f"it was cut from {self._before.st_size} to {now.st_size} bytes")
+            raise _TouchedError(errno.EIO, f"the file was cut from {self._before.st_size} to {now.st_size} bytes")
 
     def _check(self, frame: Frame, digest: FrameDigest) -> None:
         counts, preview = frame.counts, digest.preview

@@ -64,7 +64,8 @@ def window_of(train: TriggerTrain, first_pulse: PiFirstPulse) -> TriggerWindow:
     step = max(abs(train.interval), 2) if alone else abs(train.interval)
     if first_pulse is PiFirstPulse.GRID and train.start % step:
         raise ValueError(
-            f"this controller sends pulses only at integer multiples of {step} counts, and {train.start} is not one"
+            f"this controller sends pulses only at integer multiples of {step} counts, but the first pulse is at "
+            f"{train.start} counts"
         )
     before = {PiFirstPulse.AT_THRESHOLD: Fraction(0), PiFirstPulse.STEP_AFTER: Fraction(step)}
     lead = before.get(first_pulse, Fraction(step, 2))

@@ -258,7 +258,7 @@ class ZaberStage(LineStage):
         if own is None or float(own) != self.limits.counts_per_turn:
             raise DeviceRefused(
                 self.name,
-                "it has no limit.cycle.dist, so it is not a rotary stage"
+                "the device has no limit.cycle.dist, so it is not a rotary stage"
                 if own is None
                 else f"a turn has {own} microsteps",
                 expected=f"{self.limits.counts_per_turn} a turn, as configured",

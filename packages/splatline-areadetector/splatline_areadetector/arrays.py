@@ -102,7 +102,7 @@ def array_frame(value: Any, received: float, is_current: bool = False) -> ArrayF
     _refuse_colour(attributes, sizes)
     if codec and codec not in NAMES:
         raise FrameRefusedError(
-            f"its pixels are compressed with {codec}, which "
+            f"the pixels are compressed with {codec}, which "
             + ("changes the counts" if codec == "jpeg" else "this program cannot decode")
             + f"; set Codec1:Compressor to one of {', '.join(NAMES)}, or take the image before that plugin"
         )
@@ -131,17 +131,17 @@ def _refuse_colour(attributes: Mapping[str, Any], sizes: list[int]) -> None:
     if mode != _MONO or len(sizes) != 2:
         what = _COLOURS.get(mode, f"ColorMode {mode}") if mode != _MONO else f"in {len(sizes)} dimensions"
         raise FrameRefusedError(
-            f"its pixels are {what}, expected mono; set cam1:ColorMode to Mono (if the array is 3D, an earlier plugin "
+            f"the pixels are {what}, expected mono; set cam1:ColorMode to Mono (if the array is 3D, an earlier plugin "
             f"makes it 3D)"
         )
 
 
 def _refuse_type(dtype: np.dtype[Any], codec: str, element: str) -> None:
     if codec and not element:
-        raise FrameRefusedError(f"its codec {codec} does not state the type of the pixels")
+        raise FrameRefusedError(f"the codec {codec} does not state the type of the pixels")
     if dtype not in COUNTS:
         raise FrameRefusedError(
-            f"its pixels are {dtype}, but they must be uint8 or uint16; set cam1:DataType (or the DataType of the last "
+            f"the pixels are {dtype}, but they must be uint8 or uint16; set cam1:DataType (or the DataType of the last "
             "plugin that changes pixels, such as Proc1) to UInt16"
         )
 

@@ -88,10 +88,10 @@ class Counters:
         if dropped:
             return f"by the plugin {self.plugin.prefix}, whose queue was full (DroppedArrays rose by {dropped:.0f})"
         if counted is None:
-            return "before they arrived here (no counter of the IOC shows where)"
+            return "before this program received them (no counter of the IOC shows where)"
         if counted > len(gap.ids):
             return (
-                "after the plugin had sent them: in the network, or in the server's queue for this program "
+                "between the plugin and this program: in the network, or in the server's queue for this program "
                 "(ride.queue_s)"
             )
         return f"by the camera or its driver, before the plugin {self.plugin.prefix}"
