@@ -402,8 +402,8 @@ class Config(Section):
         scan, recon, angles = self.scan, self.recon, self.scan.angles
         interlaced = isinstance(angles, InterlacedAngles) and angles.passes > 1
         needs = {
-            "one scan at a time; set scan.energies to null": scan.energies is None,
-            "one scan at a time; set scan.states to null": scan.states is None,
+            "a single scan, not a series; set scan.energies to null": scan.energies is None,
+            "a single scan, not a series; set scan.states to null": scan.states is None,
             "a live volume; set recon.live to true": recon.live,
             "a volume that grows during the scan; set recon.reference to null": recon.reference is None,
             "a volume that grows during the scan; set recon.method to r2": streams(recon.method),

@@ -190,7 +190,7 @@ class DarkCheck(Logged):
     unit: ClassVar[str] = "counts of drift"
     meaning: ClassVar[str] = "a dark differs from the first one"
 
-    drift: float = setting(5.0, "counts by which a dark may differ from the first dark", ge=0)
+    drift: float = setting(5.0, "largest allowed difference between a dark and the first dark, in counts", ge=0)
 
     start = DarkState
 

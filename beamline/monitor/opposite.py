@@ -99,14 +99,14 @@ class OppositeCheck(Logged):
     unit: ClassVar[str] = "pixels"
     meaning: ClassVar[str] = "compared with the opposite projection, or with a repetition, the sample moved or changed"
 
-    warn: float = setting(0.5, "pixels by which the sample may have moved or changed", ge=0)
+    warn: float = setting(0.5, "largest allowed motion or change of the sample, in pixels", ge=0)
     changed: float = setting(
         1.0,
         "change of parts of the sample, in pixels: the shift of the whole sample that would change the projection as "
         "much",
         ge=0,
     )
-    axis: float = setting(1.0, "pixels by which the axis may differ from its stated position", ge=0)
+    axis: float = setting(1.0, "largest allowed distance of the axis from the stated position, in pixels", ge=0)
 
     start = OppositeState
 

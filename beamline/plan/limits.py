@@ -207,7 +207,7 @@ def remarks(facts: PlanFacts) -> Iterator[str]:
         exposure = plan.exposure / facts.blur_px
         yield (
             f"motion blur is {facts.blur_px:.2f} px at the detector's edge; exposure_s <= {exposure:.3g} or a longer "
-            f"period_s (now {plan.period:g}) keeps it under 1 px"
+            f"period_s (now {plan.period:g}) keeps the blur under 1 px"
         )
     if facts.skew_px > 1:
         yield (

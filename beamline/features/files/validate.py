@@ -54,8 +54,8 @@ def volume_findings(record: ReconRecord) -> Iterator[Finding]:
             low, high = min(low, float(values[finite].min())), max(high, float(values[finite].max()))
     raw, there = record.raw_file, record.parameters.get("partial")
     partial = (
-        f"The volume is partial: {there} are reconstructed, the others are empty. `beamline recon --resume` "
-        "reconstructs the others."
+        f"The volume is partial: {there} are reconstructed, the other slices are empty. `beamline recon --resume` "
+        f"reconstructs these slices."
     )
     early = "The reconstruction was stopped early; the file contains the volume reached by then."
     rules = (

@@ -160,10 +160,10 @@ _DONE = (
 )
 
 NXTOMO: tuple[Entry, ...] = (
-    Entry("definition", "states the kind of the file, but the structure of the file decides"),
+    Entry("definition", "not needed: the kind of the file is recognised by its structure"),
     Entry("detector/data", "frames [frame, row, col]; the attribute `axes` of NXdata must not state another order"),
     Entry("detector/image_key", "kind of each frame; a frame with an undefined code is invalid"),
-    Entry("detector/image_key_control", "as image_key, with -1 for alignment; it overrides image_key"),
+    Entry("detector/image_key_control", "as image_key, and -1 for an alignment frame; overrides image_key"),
     Entry("detector/count_time", "exposure time of each frame", units=datasets.TIME_UNITS),
     Entry(
         "detector/x_pixel_size",
@@ -177,12 +177,12 @@ NXTOMO: tuple[Entry, ...] = (
     ),
     Entry(
         "sample/x_pixel_size",
-        "width of a pixel at the sample; overrides that of the detector",
+        "width of a pixel at the sample; overrides the width of the detector pixel",
         units=datasets.LENGTH_UNITS,
     ),
     Entry(
         "sample/y_pixel_size",
-        "height of a pixel at the sample; overrides that of the detector",
+        "height of a pixel at the sample; overrides the height of the detector pixel",
         units=datasets.LENGTH_UNITS,
     ),
     Entry(
@@ -192,8 +192,9 @@ NXTOMO: tuple[Entry, ...] = (
     ),
     Entry(
         "instrument/source/distance",
-        "distance from source to sample; its sign and the name of the NXsource do not matter. It makes the beam a "
-        "cone, unless the magnification is below 1 % and all rays of the field of view are parallel to within half a "
+        "distance from source to sample; its sign and the name of the NXsource do not matter. With this distance, "
+        "the beam is a cone, unless the magnification is below 1 % and all rays of the field of view are parallel to "
+        "within half a "
         "pixel",
         units=datasets.LENGTH_UNITS,
     ),

@@ -41,7 +41,7 @@ class AreaDetectorSettings:
     min_period: float = setting(0.0, "Shortest time between two triggers.", unit="s", ge=0, le=100)
     dead: float = setting(
         0.0,
-        "Dead time between two exposures; readout_s if the camera cannot expose during readout.",
+        "Dead time between two exposures. Give the value of readout_s if the camera cannot expose during readout.",
         unit="s",
         ge=0,
         le=100,

@@ -95,8 +95,8 @@ class Seen:
 @click.option(
     "--scan",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="Scan of the volume, which is reconstructed again from each half of its projections. Default: the scan that "
-    "the volume names.",
+    help="Scan from which the volume was made. The command reconstructs it again from each half of the projections. "
+    "Default: the scan that the volume names.",
 )
 @click.option(
     "--quick",
