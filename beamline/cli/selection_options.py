@@ -331,7 +331,7 @@ _AFTER = (
         type=FiniteRange(),
         metavar="PX",
         help="Cone beam: detector row at which the ray perpendicular to the rotation axis meets the detector "
-        "(unbinned, 0: centre of the first row). It may lie outside the detector. Default: the middle row.",
+        "(unbinned, 0: centre of the first row). This row may lie outside the detector. Default: the middle row.",
     ),
     heading(CORRECTIONS),
 )

@@ -192,7 +192,7 @@ class StageOutputShutter(Section):
     set."""
 
     kind: Literal["stage_output"]
-    output: int = setting(doc="Number of the output. It must not be the output of the trigger pulses.", gt=0)
+    output: int = setting(doc="Number of the output. The output must not be that of the trigger pulses.", gt=0)
     open_high: bool = setting(True, "true: a high output opens the shutter.")
     settle_s: float = setting(0.1, "Time that the blade needs to open or close.", ge=0)
 

@@ -226,9 +226,12 @@ def remarks(facts: PlanFacts) -> Iterator[str]:
             f"to {plan.retakes} (monitor.retake_share): {facts.retake_seconds:.0f} s and "
             f"{size(facts.retake_bytes)} more at most"
         )
-    yield from _reference("flats", plan.flats, plan.exposure, "their intensity will be scaled")
+    yield from _reference("flats", plan.flats, plan.exposure, "the intensity of the flats will be scaled")
     yield from _reference(
-        "darks", plan.darks, plan.exposure, "their hot pixels and dark current differ from those of the projections"
+        "darks",
+        plan.darks,
+        plan.exposure,
+        "hot pixels and dark current of these darks differ from those of the projections",
     )
 
 

@@ -104,7 +104,7 @@ def next_step(scan: Path) -> str:
     with suppress(DataError, *hdf5.ALTERED), hdf5.open_hdf5(scan) as file:
         if layout.COMMITTED not in file:  # another program writes it, which has no lock that shows whether it lives
             return (
-                f"It is marked as being written, but has not changed for {QUIET:.0f} s or longer. If the "
+                f"The file is marked as being written, but has not changed for {QUIET:.0f} s or longer. If the "
                 f"program that wrote it has ended, `h5clear -s {scan}` clears the mark."
                 if abandoned(scan)
                 else f"Another program is still writing it: `beamline recon {scan} --follow` reconstructs it "
@@ -126,21 +126,22 @@ def _step_of_run(run: Path) -> str:
             "--follow` reconstructs it during the scan."
         )
     if not files_with_frames(run):
-        return "It ended before its first frame: start the scan again."
+        return "The run ended before its first frame: start the scan again."
     ride, resume = is_ride(run), f"`beamline scan --resume {run}` takes the missing projections"
     if growing:
         resume = "" if ride else f"{resume}, "
         return f"{_died(lives is False or abandoned(scan))}: {resume}`beamline recover {run}` {_MAKES}."
     if head is not None and _lacks_views(run):
         return (
-            "It ended early. It recorded the scan of another program, so it cannot be continued."
+            "The run ended early. It recorded the scan of another program, so it cannot be continued."
             if ride
-            else f"It ended early: {resume}."
+            else f"The run ended early: {resume}."
         )
     record = read_record(parts[-1])
     died = record is not None and record.state == DIED
     return (
-        f"Its process was killed after its scan file was closed: `beamline recover {run}` marks the run as ended."
+        f"The process of the run was killed after the scan file was closed: `beamline recover {run}` marks the run "
+        f"as ended."
         if died
         else ""
     )

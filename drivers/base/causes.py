@@ -54,11 +54,11 @@ def of_port(url: str, problem: BaseException) -> str:
     rows = (
         (
             number in (errno.EACCES, errno.EPERM) and group != "root",
-            f"It belongs to the group {group}: `sudo usermod -aG {group} $USER`, then log out and in",
+            f"The port belongs to the group {group}: `sudo usermod -aG {group} $USER`, then log out and in",
         ),
         (
             number in (errno.EACCES, errno.EPERM),
-            "This account has no permission to use it: ask the administrator for a udev rule that gives "
+            "This account has no permission to use the port: ask the administrator for a udev rule that gives "
             "it to one of your groups (GROUP, MODE)",
         ),
         (

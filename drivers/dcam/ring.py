@@ -58,7 +58,7 @@ class Ring:
                     reply=self.state().name,
                     expected="BUSY",
                     advice="Switch the camera off and on",
-                    state="It is not armed, and no frame was taken",
+                    state="The camera is not armed, and no frame was taken",
                 )
             clock.sleep(0.001)
 

@@ -113,7 +113,7 @@ class Travel:
         uneven = train.n > 1 and interval % self.limits.interval_unit != 0
         within = all(self.low <= at <= self.high for at in (train.start, train.end))
         if train.n < 1 or interval == 0 or close or uneven or not within:
-            raise self.cannot_emit(train, advice="Lower max_speed for pulses that are closer together" if close else "")
+            raise self.cannot_emit(train, advice="If pulses must be closer together, lower max_speed" if close else "")
 
     def cannot_emit(self, train: TriggerTrain, why: str = "", advice: str = "") -> DeviceRefused:
         """The error for a train that the stage cannot emit; the message states the conditions for trains."""

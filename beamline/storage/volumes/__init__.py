@@ -51,7 +51,7 @@ def entries() -> Registry[FormatEntry]:
             )
         if getattr(import_module(kind.__module__), kind.__name__, None) is not kind:
             raise ValueError(
-                f"its class {kind.__qualname__} is not defined at the top level of the module {kind.__module__}"
+                f"the class {kind.__qualname__} is not defined at the top level of the module {kind.__module__}"
             )
         taken.update(suffixes)
         return FormatEntry(kind.__module__, kind.__name__, suffixes)

@@ -316,7 +316,7 @@ class NXtomoWriter:
             "an earlier write failed": self._broken,
             f"it is {counts.dtype} {counts.shape}; expected uint16 {self._shape}": unlike,
             f"its preview is {preview.shape}; expected {self._preview_shape}": preview.shape != self._preview_shape,
-            f"its index is {frame.index}; expected {self._rows}, the next row": frame.index != self._rows,
+            f"the index of the frame is {frame.index}; expected {self._rows}, the next row": frame.index != self._rows,
         }
         if wrong := next((fault for fault, there in faults.items() if there), ""):
             raise DataError(

@@ -150,7 +150,8 @@ def _refuse_size(shape: tuple[int, int], dtype: np.dtype[Any], codec: str, pixel
     n_bytes = dtype.itemsize * math.prod(shape)
     if not 0 < n_bytes <= MOST_BYTES or not (codec or pixels.nbytes == n_bytes):
         raise FrameRefusedError(
-            f"it has {pixels.nbytes} bytes, which does not match its dimensions, {shape[0]} x {shape[1]} {dtype}, or "
+            f"the frame has {pixels.nbytes} bytes, which does not match the dimensions, {shape[0]} x {shape[1]} "
+            f"{dtype}, or "
             f"is more than {MOST_BYTES >> 20} MB"
         )
 
@@ -201,7 +202,7 @@ def decoded(codec: str, payload: NDArray[np.uint8], shape: tuple[int, int], dtyp
     n_bytes = dtype.itemsize * shape[0] * shape[1]
     held = int.from_bytes(payload[4:8].tobytes(), "little") if codec == "blosc" else _MOST_RATIO * payload.nbytes
     if held < n_bytes:
-        raise ValueError(f"its {codec} pixels cannot be decoded (there are fewer than {shape[0]} x {shape[1]})")
+        raise ValueError(f"the {codec} pixels cannot be decoded (there are fewer than {shape[0]} x {shape[1]})")
     chunk = payload.tobytes()
     if not chunk.startswith(struct.pack(">Q", n_bytes)):  # pvapy's simulator sends chunks with their header
         chunk = with_header(chunk, n_bytes, dtype.itemsize)
@@ -211,4 +212,4 @@ def decoded(codec: str, payload: NDArray[np.uint8], shape: tuple[int, int], dtyp
             frame.id.write_direct_chunk((0, 0), chunk)
             return frame[()].astype(dtype, copy=False)
     except (OSError, RuntimeError) as error:
-        raise ValueError(f"its {codec} pixels cannot be decoded ({error})") from error
+        raise ValueError(f"the {codec} pixels cannot be decoded ({error})") from error

@@ -148,7 +148,7 @@ class AreaDetectorCamera:
         if self._armed:
             raise DeviceRefused(self.name, "it is armed already", advice="disarm() it first")
         if n_frames < 1:
-            raise DeviceRefused(self.name, f"it cannot be armed for less than one frame ({n_frames})")
+            raise DeviceRefused(self.name, f"the camera cannot be armed for less than one frame ({n_frames})")
         labels, trigger = self._labels, self._settings.trigger
         self._await_silence()
         by_pulse = trigger is TriggerSource.EXTERNAL
