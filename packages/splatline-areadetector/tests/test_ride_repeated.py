@@ -27,7 +27,8 @@ WAITING = "Waiting for the first frame"
     [
         ([range(1, 21), range(21, 41)], False, 0, "Recorded: 2 scans; in 0 of these scans, frames are missing."),
         ([range(1, 21), [*range(21, 31), *range(32, 41)], range(41, 61)], False, 5,
-         "Recorded: 3 scans; in 1 of these scans, frames are missing. The last of these: 1 of 20 projections is missing: 10"),
+         "Recorded: 3 scans; in 1 of these scans, frames are missing. The last of these: 1 of 20 projections is "
+         "missing: 10"),
         ([range(1, 21)], True, 4, "Recorded: 1 scan before this one; in 0 of these scans, frames are missing."),
     ],
 )  # fmt: skip
