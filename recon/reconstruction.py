@@ -112,8 +112,8 @@ def _warn_of_unknown(data: NDArray[np.float32], weights: Any) -> None:
     )
     if 0 < lost < data.size:
         warnings.warn(
-            f"{lost} of {data.size} values of the projections are not finite. They are filled from their neighbours "
-            "and get weight 0. To avoid this warning, give these values the weight 0 in DataUse(weights)",
+            f"{lost} of {data.size} values of the projections are not finite. These values are filled from their "
+            f"neighbours and get weight 0. To avoid this warning, give these values the weight 0 in DataUse(weights)",
             stacklevel=3,
         )
 

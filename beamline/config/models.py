@@ -290,8 +290,9 @@ class ReconSection(Section):
     )
     reference: str | None = setting(
         None,
-        "File with an earlier, careful volume of the same sample, or with its scan; relative to the configuration "
-        "file. After the scan, the volume is then made with this reference, and `method` is ignored. null: no "
+        "File with a volume from an earlier, careful scan of the same sample, or that scan itself. The path is "
+        "relative to the configuration file. After the scan, the volume is then made with this reference, and "
+        "`method` is ignored. null: no "
         "reference.",
         min_length=1,
     )

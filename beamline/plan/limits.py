@@ -261,7 +261,7 @@ def _speed(facts: PlanFacts) -> Iterator[str]:
     if facts.views.speed > facts.stage.max_speed * (1 + 1e-9):
         period = facts.plan.period * facts.views.speed / facts.stage.max_speed
         yield (
-            f"the scan needs {degrees(facts.views.speed)}/s, the stage turns at most "
+            f"the scan needs {degrees(facts.views.speed)}/s, but the stage turns at most "
             f"{degrees(facts.stage.max_speed)}/s; set scan.period_s >= {rounded(period, up=True):g} or take more "
             "projections"
         )

@@ -271,8 +271,8 @@ def _doubts(
         at = len(unexplained.significance) // 2
         yield Picture(
             "Residual in the projections",
-            "Filtered back-projection of the residual, divided by its noise. It should be even noise, with "
-            "values seldom above 4 or below -4. An edge, crack or pore that is visible here is in the "
+            "Filtered back-projection of the residual, divided by its noise. The picture should show even noise, "
+            "with values seldom above 4 or below -4. An edge, crack or pore that is visible here is in the "
             "projections, but not in the volume. Blue: the volume is too dense, red: not dense enough.",
             pictures.significance(unexplained.significance[at], result.volume.grid, unexplained.first + at, unit),
         )
@@ -312,8 +312,8 @@ def _views(prepared: PreparedProjections) -> Iterator[Picture]:
         moved = geometry.shifts * geometry.sample_pitch
         yield Picture(
             "Poses of the projections",
-            "Shift at the sample, roll and tilt of each projection, against the angle of the stage. They show runout, "
-            "wobble, drift and jumps. `beamline export --poses` writes them as a table.",
+            "Shift at the sample, roll and tilt of each projection, against the angle of the stage. These curves "
+            "show runout, wobble, drift and jumps. `beamline export --poses` writes the values as a table.",
             pictures.pose_curves(np.degrees(geometry.angles), moved, turns, unit),
         )
 

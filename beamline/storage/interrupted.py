@@ -111,7 +111,7 @@ def next_step(scan: Path) -> str:
                 "during the scan."
             )
     if held(scan):
-        return f"Its scan is still running: `beamline recon {scan} --follow` reconstructs it during the scan."
+        return f"The scan is still running: `beamline recon {scan} --follow` reconstructs it during the scan."
     return f"{_died(abandoned(scan))}: `beamline recover {scan}` {_MAKES}."
 
 
@@ -122,7 +122,7 @@ def _step_of_run(run: Path) -> str:
     growing = head is not None and head.open_for_writing
     if lives or held(run / EVENTS, exclusively=True) or (growing and held(scan)):
         return (
-            f"Its scan is still running: `beamline watch {run}` shows it, and `beamline recon {scan} "
+            f"The scan is still running: `beamline watch {run}` shows it, and `beamline recon {scan} "
             "--follow` reconstructs it during the scan."
         )
     if not files_with_frames(run):

@@ -172,7 +172,8 @@ NXTOMO: tuple[Entry, ...] = (
     ),
     Entry(
         "detector/y_pixel_size",
-        "height of a pixel, and distance of the slices in a parallel beam; otherwise pixels must be square",
+        "height of a pixel. In a parallel beam, this is also the distance between slices; in other beams, pixels "
+        "must be square",
         units=datasets.LENGTH_UNITS,
     ),
     Entry(

@@ -51,7 +51,8 @@ class EpicsSettings(StageFigures):
     active_high: ClassVar[bool] = True
     """There is no cable; only checks of trigger pulses need one."""
     unit: str = setting(
-        "deg", "Unit of the record (EGU). A linear axis has mm; every key with deg in its name then means mm."
+        "deg",
+        "Unit of the record (EGU). For a linear axis the unit is mm, and every key with deg in its name is then in mm.",
     )
     search: Search = setting(
         Search.NONE, "How `beamline home` searches the reference: none, forward (HOMF) or reverse (HOMR)."

@@ -210,7 +210,7 @@ VIOLATIONS = {
     "exposure over period": ({"exposure": 0.2}, "scan.exposure_s 0.2 is longer than scan.period_s 0.1"),
     "speed": (
         {"angles": angles.fixed(40, 90 * DEG)},
-        "needs 45°/s, the stage turns at most 30°/s; set scan.period_s >= 0.15",
+        "needs 45°/s, but the stage turns at most 30°/s; set scan.period_s >= 0.15",
     ),
     "start": ({"angles": angles.fixed(360, -5 * DEG)}, "go from -5.5° to 175° (with 0.5° of run-up at each end)"),
     "end": ({"angles": angles.fixed(360, 186 * DEG)}, "limits are -5° ... 365°"),

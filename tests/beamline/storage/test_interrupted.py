@@ -82,7 +82,7 @@ def test_a_scan_that_died_can_be_resumed_or_recovered_and_its_file_alone_be_reco
         "The process of its scan was killed, unless a program is still writing to it: "
     )  # perhaps no locks
     for lock in (WriterLock(scan), WriterLock(died / "config.resolved.yaml", exclusive=True)):
-        assert next_step(scan).startswith(f"Its scan is still running: `beamline watch {died}`")
+        assert next_step(scan).startswith(f"The scan is still running: `beamline watch {died}`")
         assert "recover" not in next_step(scan)
         lock.release()
 
