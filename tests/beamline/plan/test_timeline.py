@@ -332,11 +332,11 @@ REMARKS = {
     "no darks": ({"darks": FieldPlan(5, Place.NONE, 0.05)}, "no darks will be taken"),
     "exposure": (
         {"flats": FieldPlan(5, Place.END, 0.1)},
-        "flats are exposed for 0.1 s and projections for 0.05 s; their intensity",
+        "flats are exposed for 0.1 s and projections for 0.05 s; the intensity of the flats",
     ),
     "darks' exposure": (
         {"darks": FieldPlan(5, Place.END, 0.1)},
-        "darks are exposed for 0.1 s and projections for 0.05 s; th",
+        "darks are exposed for 0.1 s and projections for 0.05 s; hot pixels",
     ),
     "blur": ({"exposure": 0.09, "angles": angles.fixed(360, 0, 2 * math.pi)}, "motion blur is 1.98 px"),
 }
