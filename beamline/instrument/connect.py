@@ -28,7 +28,8 @@ from beamline.config.beam import (
     StageOutputShutter,
 )
 from beamline.config.devices import DcamOrca, SimulatedOrca
-from beamline.config.load import Config, camera_settings
+from beamline.config.load import Config
+from beamline.config.planned import camera_settings
 from beamline.core.errors import ConfigError
 from drivers.base.clock import Clock, SystemClock
 from drivers.base.protocols import (

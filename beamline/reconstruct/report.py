@@ -249,7 +249,8 @@ def _doubts(
         yield Picture("Missing wedge", _of_wedges(unseen), pictures.wedges(result.volume, unseen, unit))
     if result.change is not None:
         moved = Volume(result.volume.data - result.change.data, result.volume.grid)
-        left = unexplained_by(moved, prepared.views.seen, np.random.default_rng(0))
+        check = unexplained_by(moved, prepared.views.seen, np.random.default_rng(0))
+        left = check.alone(moved, prepared.geometry)
         yield Picture(
             "Change since the reference",
             "A slice of the moved reference, of this volume, and of their difference. Red: denser than before, blue: "

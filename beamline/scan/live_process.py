@@ -16,7 +16,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TextIO
 
-from beamline.config.load import Config, plan_of
+from beamline.config.load import Config
+from beamline.config.planned import plan_of
 from beamline.core.event_lines import event_of
 from beamline.core.events import Done, Failed, Sink, StateEntered, Warned
 from beamline.core.machine import free_memory

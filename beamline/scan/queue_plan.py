@@ -15,7 +15,7 @@ from beamline.core.text import aligned, count, size
 from beamline.plan.limits import ROOM
 from beamline.plan.needs import NOTHING, ScanNeeds, all_needs
 from beamline.plan.timeline import hms_text
-from beamline.scan.preflight import DryRun
+from beamline.scan.dry_run import DryRun
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from beamline.config.tree import Override
 from beamline.core.errors import ConfigError, DataError, user_message
 from beamline.core.files import SETTINGS, TABLE, text_in
 from beamline.core.text import count
-from beamline.scan.preflight import doubts, dry_run
+from beamline.scan.dry_run import doubts, dry_run
 from beamline.scan.queue_plan import PlannedScan, QueuePlan, ScanFault, queue_of
 from beamline.storage.writer_lock import no_locks
 

@@ -30,10 +30,11 @@ from beamline.core.sinks import Announcer, JsonLines, UserLog, fan_out
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.instrument.connect import ConnectedDevices, clock_after, connect
 from beamline.scan.control import NEXT, State, StateMachine, verbs_taken
+from beamline.scan.dry_run import all_of
 from beamline.scan.live_plan import live_plan
 from beamline.scan.live_process import Commands, LiveCommand, Standby, follow_command, reconstruct
 from beamline.scan.measurement import FrameSource, Measurement, Turn
-from beamline.scan.preflight import ReadyScan, all_of, preflight
+from beamline.scan.preflight import ReadyScan, preflight
 from beamline.scan.references import first_state
 from beamline.scan.resume import ResumableRun
 from beamline.scan.runs import record_sink

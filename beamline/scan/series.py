@@ -19,10 +19,10 @@ from beamline.core.sinks import Warn, fan_out
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import clock_after, connect
 from beamline.scan.control import State
+from beamline.scan.dry_run import dry_run, refuse_violations
 from beamline.scan.exposures import SLICE
 from beamline.scan.live_process import Commands, reconstruct
 from beamline.scan.measurement import Measurement
-from beamline.scan.preflight import dry_run, refuse_violations
 from beamline.scan.resume import (
     NoFrame,
     NothingMissing,

@@ -19,8 +19,9 @@ from recon.base.view_data import Views
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import fbp, fbp_memory, is_gridded
-from recon.voxels.projector import Projector, seen_rays
-from recon.voxels.resolution import at_voxel_resolution
+from recon.voxels.one_projection import AskedRays, RayCheck, in_bands
+from recon.voxels.projector import Projector, projection_images, seen_rays
+from recon.voxels.resolution import ViewResolution, at_voxel_resolution
 from recon.voxels.view_weights import seen_by
 
 STRAY_LIMIT = 0.05
@@ -164,7 +165,7 @@ class Unexplained:
     significance: F32
 
 
-def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> Unexplained | None:
+def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> RayCheck[Unexplained | None]:
     """Filtered back-projection of the residual p - A x, divided by its noise (measured with random signs).
 
     With random signs of the projections, structure cancels, because all projections share it, and noise remains [our
@@ -177,13 +178,14 @@ def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> Unexpl
         seen: the projections.
 
     Returns:
-        None for a cone, rolled or tilted projections, fewer than 16 projections, other slices, or a volume without
-        material.
+        The check. Its result is None for a cone, rolled or tilted projections, fewer than 16 projections, other slices,
+        or a volume without material.
     """
+    nothing: RayCheck[Unexplained | None] = RayCheck((), lambda: None)
     geometry, slices = seen.geometry, volume.grid.shape[0]
     rows_differ = geometry.is_cone or not geometry.is_straight or volume.grid != Grid.matching(geometry)
     if rows_differ or geometry.n_views < _LEAST_VIEWS:
-        return None
+        return nothing
     n = min(_rows_looked_at(geometry), slices)
     mass = np.array([np.maximum(image, 0).sum(dtype=np.float64) for image in volume.data])
     middle = round(float(mass @ np.arange(slices) / mass.sum())) if mass.any() else 0
@@ -191,27 +193,38 @@ def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> Unexpl
     if geometry.climbs:  # few projections see the slices in between
         at = volume.grid.coordinates()[0] / geometry.pixel_pitch + geometry.axis_row
         first = int(np.convolve(mass * seen_by(geometry, at).sum(axis=0), np.ones(n), "valid").argmax())
-    rows, views, box = part_of(geometry, volume.grid, slice(first, first + n))
+    rows, _, box = part_of(geometry, volume.grid, slice(first, first + n))
     part = Volume(np.ascontiguousarray(volume.data[first : first + n]), box)
     level = _DENSE * float(np.percentile(part.data, 99))
     matter = np.stack([ndimage.binary_closing(image > level, iterations=_CLOSED) for image in part.data])
     if level <= 0 or not matter.any():
-        return None
-    measured, projector = seen.data[:, rows], Projector(views, part.grid)
-    unseen = np.broadcast_to(~seen_rays(views, part.grid), measured.shape)
-    if seen.weights is not None:
-        unseen = unseen | (seen.weights[:, rows] == 0)
-    lines = np.where(unseen, np.float32(0), measured).swapaxes(1, 2)  # at the resolution of voxels, like the model
-    left = at_voxel_resolution(lines, projector.resolution, ~unseen.swapaxes(1, 2)).swapaxes(1, 2)
-    left = left - projector.forward(part.data)
+        return nothing
+    shown, model = seen.rows(rows), list[F32]()
+    parts = [AskedRays(np.arange(geometry.n_views), rows, lambda lines: model.append(projection_images(lines)))]
+    if not in_bands(geometry, volume.grid):  # the rows also show other slices, so these slices are projected alone
+        parts, model = [], [Projector(shown.geometry, box).forward(part.data)]
+    return RayCheck(parts, lambda: _structure(shown, model[0], part, first, matter, rng))
+
+
+def _structure(
+    shown: Views, model: F32, part: Volume, first: int, matter: Mask, rng: np.random.Generator
+) -> Unexplained:
+    """See `unexplained`; the part starts at slice `first`, and `model` is its projection [view, row, col]."""
+    geometry, box = shown.geometry, part.grid
+    unseen = np.broadcast_to(~seen_rays(geometry, box), model.shape)
+    if shown.weights is not None:
+        unseen = unseen | (shown.weights == 0)
+    lines = np.where(unseen, np.float32(0), shown.data).swapaxes(1, 2)  # at the resolution of voxels, like the model
+    left = at_voxel_resolution(lines, ViewResolution.of(geometry, box), ~unseen.swapaxes(1, 2)).swapaxes(1, 2)
+    left = left - model
     left[unseen] = 0
-    left -= ring_offsets(left, views)
+    left -= ring_offsets(left, geometry)
     left[unseen] = 0
 
     signs = np.where(np.arange(len(left)) % 2, np.float32(1), np.float32(-1))
     kinds = np.stack([np.ones_like(signs), *(rng.permutation(signs) for _ in range(_FLIPS))])
-    first_kind, *flipped = _fbp_of_each(left, kinds, views, box)
-    found, variance = _smoothed(first_kind), np.zeros(part.grid.shape, np.float32)
+    first_kind, *flipped = _fbp_of_each(left, kinds, geometry, box)
+    found, variance = _smoothed(first_kind), np.zeros(box.shape, np.float32)
     for images in flipped:
         variance += _smoothed(images) ** 2 / _FLIPS
     noise = np.sqrt(gaussian_filter(variance, (0, _AROUND, _AROUND)))

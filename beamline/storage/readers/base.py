@@ -113,6 +113,17 @@ class ScanSource(ABC):
         return None
 
     @property
+    def stack_options(self) -> tuple[str, str]:
+        """Path of the dataset of the projections, and the options that name the other datasets; "" for formats whose
+        datasets cannot be chosen by options."""
+        return str(self.attributes.get("data", "")), ""
+
+    def exchange_sinogram(self, *, views_first: bool) -> str:
+        """What the user can do to exchange the two dimensions of a sinogram, of which the first is now that of the
+        projections or of the columns."""
+        return f"give --order {'col,view' if views_first else 'view,col'}"
+
+    @property
     def frame_bytes(self) -> int:
         """Bytes that are decompressed to read a frame, or any row of it."""
         return self.shape[0] * self.shape[1] * self.dtype.itemsize

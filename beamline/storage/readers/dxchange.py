@@ -49,6 +49,8 @@ PLACES = (
     (FrameKind.PROJECTION, "/exchange/data"),
 )
 
+_OTHERS = (("angle", "theta"), ("dark", "data_dark"), ("flat", "data_white"))  # names of options, and datasets
+
 
 def open_exchange(path: Path, *, follow: bool = False, own_angles: bool = True) -> ExchangeSource:
     """Open a Data Exchange file. `own_angles` False: the caller supplies the angles, so theta may be absent."""
@@ -100,6 +102,13 @@ class ExchangeSource(StacksSource):
     own_angles: bool = True
     grows: bool = False
     angles_unit = "degrees"
+
+    @property
+    def stack_options(self) -> tuple[str, str]:
+        return "exchange/data", "".join(f" --{name}s-path exchange/{where}" for name, where in _OTHERS)
+
+    def exchange_sinogram(self, *, views_first: bool) -> str:
+        return f"set the attribute axes of /exchange/data to {'x:theta' if views_first else 'theta:x'}"
 
     def refresh(self) -> int:
         if not self.grows:

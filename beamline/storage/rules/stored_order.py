@@ -40,24 +40,16 @@ def axis_vertical(scan: ScanEvidence) -> Iterator[Finding]:
         )
 
 
-_EXCHANGE = (("angle", "theta"), ("dark", "data_dark"), ("flat", "data_white"))
-
-
 def _exchanged(scan: ScanEvidence) -> str:
     """How rows and columns of stacks in HDF5 are exchanged, as a sentence; "" for other formats.
 
     MATLAB writes dimensions in reverse. A quarter turn would show the mirror image of these.
     """
-    data, dimensions = (
-        scan.source.attributes.get("data"),
-        str(scan.source.attributes.get("dimensions", "frame,row,col")),
-    )
-    others = ""
-    if scan.source.format == "data_exchange":
-        data, others = "exchange/data", "".join(f" --{name}s-path exchange/{at}" for name, at in _EXCHANGE)
+    data, others = scan.source.stack_options
+    dimensions = str(scan.source.attributes.get("dimensions", "frame,row,col"))
     order = ",".join({"row": "col", "col": "row"}.get(axis, axis) for axis in dimensions.split(","))
     say = f"If rows and columns are exchanged, as MATLAB writes them, give --data-path {data}:{order}{others}. "
-    return "" if data is None else say
+    return say if data else ""
 
 
 def change_of_rows(depths: NDArray[np.float64]) -> float:
@@ -124,10 +116,7 @@ def sinogram_assumed(scan: ScanEvidence) -> Iterator[Finding]:
     axes = str(scan.source.attributes.get("dimensions", "")).split(",")
     if sorted(axes) == ["col", "frame"]:
         n = scan.table.views.size
-        first = axes[0] == "frame"
-        option = f"give --order {'col,view' if first else 'view,col'}"
-        if scan.source.format == "data_exchange":
-            option = f"set the attribute axes of /exchange/data to {'x:theta' if first else 'theta:x'}"
+        option = scan.source.exchange_sinogram(views_first=axes[0] == "frame")
         yield Finding(
             "info",
             SINOGRAM,
