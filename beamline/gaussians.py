@@ -41,8 +41,9 @@ def read_model(path: Path) -> Model:
         arrays = record.model
         if not arrays:
             raise DataError(
-                f"{path} contains no Gaussians: {record.parameters.get('method', 'its method')} has none, or the "
-                "volume was made in slabs. Expected a volume of r2 made at once. Nothing was written."
+                f"{path} contains no Gaussians: {record.parameters.get('method', 'its method')} does not use "
+                f"Gaussians, or the volume was made in slabs. Expected a volume of r2 made at once. Nothing was "
+                f"written."
             )
         rows, cols = (int(n) for n in arrays["detector_shape"])
         sod, sdd = (float(d) for d in arrays["source_distances"])

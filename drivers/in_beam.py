@@ -87,7 +87,7 @@ class PlacedStage:
                 return ""
             now, place = self._stage.position(), self.place()
             named = f" ({place})" if place else ""
-            return f"it was at {math.degrees(before):.4f} deg, and is now at {math.degrees(now):.4f} deg{named}"
+            return f"the device was at {math.degrees(before):.4f} deg, and is now at {math.degrees(now):.4f} deg{named}"
 
         return moved
 

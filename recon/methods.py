@@ -57,7 +57,7 @@ def _entry(name: str, method: type[Method]) -> MethodEntry:
     entry = MethodEntry(method.__module__, method.__name__, hasattr(method, "stream"))
     if getattr(import_module(entry.module), entry.cls, None) is not method:
         raise ValueError(
-            f"its class {method.__qualname__} must be defined at the top level of the module {entry.module}"
+            f"the class {method.__qualname__} must be defined at the top level of the module {entry.module}"
         )
     _ = method(), method.label  # every setting has a default
     return entry

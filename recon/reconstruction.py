@@ -115,8 +115,8 @@ def _warn_of_unknown(data: NDArray[np.float32], weights: Any) -> None:
     )
     if 0 < lost < data.size:
         warnings.warn(
-            f"{lost} of {data.size} values of the projections are not finite. They are filled from their neighbours "
-            "and get weight 0. To avoid this warning, give these values the weight 0 in DataUse(weights)",
+            f"{lost} of {data.size} values of the projections are not finite. These values are filled from their "
+            f"neighbours and get weight 0. To avoid this warning, give these values the weight 0 in DataUse(weights)",
             stacklevel=3,
         )
 
@@ -139,8 +139,8 @@ def _warn_of_unseen_cone(method: Method, geometry: Geometry) -> None:
         warnings.warn(
             "give a weight of total variation: fista-tv with tv_weight 0.001, or 0.002 for a plate with sharp edges. "
             f"In all projections the rotation axis is tilted along the beam, by {math.degrees(lean):.3g} degrees or "
-            "more. Structure along the axis, such as the faces of a plate, is then in no projection. Held-out "
-            "projections do not show it either, and choose too small a weight",
+            "more. No projection then shows structure along the axis, such as the faces of a plate. Held-out "
+            "projections do not show this structure either, so they choose a weight that is too small",
             stacklevel=3,
         )
 

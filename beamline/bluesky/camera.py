@@ -195,7 +195,7 @@ class _Frames(DetectorAcquireLogic):
             except DeviceTimeout as error:
                 waited += LOOK_EVERY
                 if waited >= patience:
-                    raise error.told_by(error.device, f"sent no frame for {patience:g} s after its trigger") from error
+                    raise error.told_by(error.device, f"sent no frame for {patience:g} s after the trigger") from error
         return None
 
 

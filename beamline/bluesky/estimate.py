@@ -72,7 +72,7 @@ class _Messages:
         if not limits.low <= target <= limits.high:
             reach = f"{degrees(limits.low)} ... {degrees(limits.high)}"
             self.faults.append(
-                ScanFault(f"the plan moves {stage.name} to {degrees(target)}, the limits of the stage are {reach}")
+                ScanFault(f"the plan moves {stage.name} to {degrees(target)}, but the limits of the stage are {reach}")
             )
 
     def _expose(self, camera: CameraDetector) -> None:
@@ -112,7 +112,9 @@ def scans_of(plan: Generator[Any, Any, Any]) -> tuple[PlannedScan, ...]:
         others.faults.append(ScanFault(str(error)))
     except Exception as error:  # an error of the plan, because it got no measured values
         what = f"{type(error).__name__}: {error}"
-        others.faults.append(ScanFault(f"the plan cannot be followed without running it ({what})"))
+        others.faults.append(
+            ScanFault(f"the plan cannot be predicted, because it stops without measured values ({what})")
+        )
     if others.needs or others.faults:
         rest = f"{source}, other messages" if scans else source
         needs = all_needs(others.needs)

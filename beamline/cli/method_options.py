@@ -104,7 +104,10 @@ def _instead(name: str, owners: Mapping[str, Sequence[str]]) -> str:
     others = [other for other, methods in owners.items() if not set(methods) & set(owners[name])]
     if not others:
         return "add --method with one of these methods."
-    return f"--{others[-1]} works only with {', '.join(owners[others[-1]])}. No method has both: leave one of them out."
+    return (
+        f"--{others[-1]} works only with {', '.join(owners[others[-1]])}. No method has both options: leave one "
+        f"of them out."
+    )
 
 
 def method_with(name: str, settings: Mapping[str, Any], any_setting: Mapping[str, Any] | None = None) -> Method:
@@ -220,7 +223,7 @@ _WITH_REFERENCE = option(
     metavar="GOOD",
     help="Earlier volume of the same sample, or an earlier scan of it, which is then reconstructed first. The motion "
     "of the sample since then, and the grey level of each particle, are estimated from the projections. Held-out "
-    "projections decide whether the earlier volume is used. If it is not, the result is that of auto.",
+    "projections decide whether the earlier volume is used. If they decide against it, the result is that of auto.",
 )
 _IN_TIME = together(
     option(
@@ -250,7 +253,7 @@ equal_time = option(
     "--seconds",
     excludes={
         "iterations": "give one of them",
-        **dict.fromkeys(("volumes", "spectra"), "it belongs to methods that reconstruct one volume"),
+        **dict.fromkeys(("volumes", "spectra"), "this option belongs to methods that reconstruct a single volume"),
     },
     type=POSITIVE,
     metavar="EACH",

@@ -95,7 +95,8 @@ def monitor(request: MonitorRequest) -> None:
     if alarmed or references:
         faults = f"; groups of darks or flats with a fault: {len(references)}" if references else ""
         raise AlarmError(
-            f"{request.file}: {len(alarmed)} of {n} frames have an alarm{faults}. They are listed on stdout."
+            f"{request.file}: {len(alarmed)} of {n} frames have an alarm{faults}. The list of these frames is on "
+            f"stdout."
         )
 
 

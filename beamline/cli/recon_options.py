@@ -75,8 +75,9 @@ memory_option = option(
     excludes=EXCLUDED["memory"],
     metavar="SIZE",
     callback=parsed(memory_size),
-    help="Memory that may be used, for example 8G or 500M. A parallel-beam scan that needs more is kept on the disk of "
-    "the output and reconstructed slab by slab. Default: 70 % of the free memory, within the limit of a container.",
+    help="Memory that may be used, for example 8G or 500M. A parallel-beam scan that needs more memory is kept on "
+    "the disk of the output and reconstructed slab by slab. Default: 70 % of the free memory, within the limit of a "
+    "container.",
 )
 
 recon_options = together(
@@ -102,8 +103,8 @@ recon_options = together(
         type=NameChoice(["ram-lak", "shepp-logan", "hann"]),
         default="hann",
         show_default=True,
-        help="Filter of fbp, also of the fbp volume that other methods are compared with. hann suits few or noisy "
-        "projections best.",
+        help="Filter of fbp, and of the fbp volume with which other methods are compared. hann is best for few or "
+        "noisy projections.",
     ),
     heading(OUTPUT),
     option(
@@ -176,7 +177,8 @@ recon_options = together(
         metavar="local:N|tcp://HOST:PORT",
         callback=parsed(cluster_of),
         help="Reconstruct slabs in parallel with dask.distributed, if the volume is made in slabs: with N workers on "
-        "this computer, or with those of a scheduler. Needs splatline-cluster. Default: one slab after the other.",
+        "this computer, or with the workers of a scheduler. Needs splatline-cluster. Default: one slab after the "
+        "other.",
     ),
     heading(OUTPUT),
     option(

@@ -80,9 +80,10 @@ class ScanRequest:
         "--reference",
         metavar="GOOD",
         type=click.Path(path_type=Path),
-        help="Volume of the same sample from an earlier, careful scan, or that scan itself. During the scan the live "
-        "picture shows the moved reference and what changed, and afterwards the volume is made with it, as by "
-        "`beamline recon --reference`. The same as recon.reference in CONFIG.",
+        help="Volume of the same sample from an earlier, careful scan, or that scan itself. During the scan, the "
+        "live picture shows this reference, moved to the present position of the sample, and what has changed. After "
+        "the scan, the volume is made with this reference, as with `beamline recon --reference`. The same as "
+        "recon.reference in CONFIG.",
     )
     output: Path | None = set_by(
         "-o",

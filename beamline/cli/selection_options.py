@@ -87,7 +87,7 @@ scan_options = together(
         "--order",
         metavar="DIMENSIONS",
         help="Order of the dimensions of the projections. The default is frame,row,col. Give row,view,col for a stack "
-        "of sinograms, and view,col or col,view for a single sinogram. Also for a series of images.",
+        "of sinograms, and view,col or col,view for a single sinogram. This option also works for a series of images.",
     ),
     option("--darks-path", metavar="DATASET", help="With --data-path: name of the dataset with the darks."),
     option("--flats-path", metavar="DATASET", help="With --data-path: name of the dataset with the flats."),
@@ -102,7 +102,8 @@ scan_options = together(
         metavar="KINDS",
         help=(
             "State which frames are darks and flats, for example darks=0:5,flats=5:10+95:100. All others are "
-            "projections. Overrides the file. none=30:38+61:62 leaves these frames out. If you give only none=, the "
+            "projections. This option overrides the file. none=30:38+61:62 leaves these frames out. If you give only "
+            "none=, the "
             "file states the kind of the other frames. 0::2 or 1::2: use every second projection with its darks and "
             "flats, if two exposures or thresholds alternate."
         ),
@@ -274,7 +275,8 @@ _BEFORE = (
         "--cols",
         callback=parsed(span),
         metavar="FIRST:END",
-        help="Detector columns to use, as if the detector had no others: --axis and messages count columns from FIRST. "
+        help="Detector columns to use, as if the detector had only these columns: --axis and messages count columns "
+        "from FIRST. "
         "Default: all.",
     ),
     option(
@@ -283,7 +285,7 @@ _BEFORE = (
         type=WholeRange(min=1),
         default=1,
         show_default=True,
-        help="Average blocks of N x N pixels: less noise, memory and time, voxels N times as large.",
+        help="Average blocks of N x N pixels. This reduces noise, memory and time, and makes voxels N times as large.",
     ),
     option(
         "--axis",
@@ -329,7 +331,7 @@ _AFTER = (
         type=FiniteRange(),
         metavar="PX",
         help="Cone beam: detector row at which the ray perpendicular to the rotation axis meets the detector "
-        "(unbinned, 0: centre of the first row). It may lie outside the detector. Default: the middle row.",
+        "(unbinned, 0: centre of the first row). This row may lie outside the detector. Default: the middle row.",
     ),
     heading(CORRECTIONS),
 )

@@ -148,11 +148,11 @@ class BeamMonitorSection(Section):
         1.0, "Real time between readings during a scan. The readings are stored in the file of the scan.", gt=0, le=1e6
     )
     pause_below: float | None = setting(
-        None, "In `unit`: the scan pauses if the reading is below this value; null: it never pauses.", gt=0
+        None, "Reading below which the scan pauses, in the unit of the key `unit`; null: the scan never pauses.", gt=0
     )
     resume_above: float | None = setting(
         None,
-        "In `unit`: a paused scan continues when the reading has reached this value again; null: a tenth above "
+        "Reading from which on a paused scan continues, in the unit of the key `unit`; null: a tenth above "
         "pause_below.",
         gt=0,
     )
@@ -192,7 +192,7 @@ class StageOutputShutter(Section):
     set."""
 
     kind: Literal["stage_output"]
-    output: int = setting(doc="Number of the output. It must not be the output of the trigger pulses.", gt=0)
+    output: int = setting(doc="Number of the output. The output must not be that of the trigger pulses.", gt=0)
     open_high: bool = setting(True, "true: a high output opens the shutter.")
     settle_s: float = setting(0.1, "Time that the blade needs to open or close.", ge=0)
 

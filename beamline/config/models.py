@@ -143,13 +143,13 @@ class StatesSection(Section):
     count: int = setting(doc="Number of states.", ge=2, le=1000)
     every_s: Seconds | None = setting(
         None,
-        "Time from the begin of one state to the begin of the next; a state that takes longer delays the next one. "
+        "Time from the start of one state to the start of the next one. A state that takes longer delays the next one. "
         "null: each state after the first waits for `beamline resume`, from a terminal or a script.",
     )
     references: Literal["first", "each"] = setting(
         "first",
-        "Darks and flats of the states after the first. first: those of the first state are copied into their files. "
-        "each: each state takes its own.",
+        "Darks and flats of the states after the first one. first: the darks and flats of the first state are copied "
+        "into the files of the others. each: each state takes its own darks and flats.",
     )
 
 
@@ -158,7 +158,8 @@ class ScanSection(Section):
     angles: AnglesSection
     exposure_s: Seconds
     period_s: Seconds = setting(
-        doc="Time between projections. It sets the speed of a fly scan, and the shortest time per frame of a step scan."
+        doc="Time between projections. This time sets the speed of a fly scan, and the shortest time per frame of a "
+        "step scan."
     )
     frames_per_view: int = setting(
         1,
@@ -186,18 +187,18 @@ class ScanSection(Section):
     )
     energies: tuple[Kev, ...] | None = setting(
         None,
-        "Energies in keV of a series: one scan at each energy, one after the other. Each scan begins a fraction of an "
-        "angular step later than the scan before.",
+        "Energies in keV of a series: one scan at each energy, one after the other. The start angle of each scan is "
+        "larger than that of the scan before, by a fraction of an angular step.",
         min_length=2,
         max_length=1000,
     )
     states: StatesSection | None = setting(
         None,
-        "A series of states of a sample that changes: one scan of each, in one folder. Each scan begins a fraction of "
-        "an angular step later than the scan before. null: one scan.",
+        "A series of states of a sample that changes: one scan of each state, all in one folder. The start angle of "
+        "each scan is larger than that of the scan before, by a fraction of an angular step. null: one scan.",
     )
     state: int | None = setting(
-        None, "Number of this scan in such a series, from 1; the series sets it.", ge=1, le=1000
+        None, "Number of this scan in a series of states, counted from 1. The program sets this number.", ge=1, le=1000
     )
     offset_views: int = setting(
         0,
@@ -217,10 +218,17 @@ class ScanSection(Section):
     )
     target: TargetSection = TargetSection(quality_db=1.0)
     wait_s: float = setting(
-        30.0, "Longest wait for a prediction after a pass, and then for the operator's decision.", ge=0, le=3600
+        30.0,
+        "Longest time for which the scan waits for a prediction after a pass, and then again for the decision "
+        "of the operator.",
+        ge=0,
+        le=3600,
     )
     pass_views: int = setting(
-        0, "Projections per pass of a step scan; a fly scan has the passes of interlaced angles.", ge=0, le=1_000_000
+        0,
+        "Projections per pass of a step scan. In a fly scan, the passes of the interlaced angles are used instead.",
+        ge=0,
+        le=1_000_000,
     )
     darks: Fields = Fields()
     flats: Fields = Fields()
@@ -283,8 +291,10 @@ class ReconSection(Section):
     )
     reference: str | None = setting(
         None,
-        "File with an earlier, careful volume of the same sample, or with its scan; relative to the configuration "
-        "file. The volume is then made from it after the scan, whatever `method` says. null: there is none.",
+        "File with a volume from an earlier, careful scan of the same sample, or that scan itself. The path is "
+        "relative to the configuration file. After the scan, the volume is then made with this reference, and "
+        "`method` is ignored. null: no "
+        "reference.",
         min_length=1,
     )
     axis: Literal["auto"] | Column = "auto"
@@ -401,8 +411,8 @@ class Config(Section):
         scan, recon, angles = self.scan, self.recon, self.scan.angles
         interlaced = isinstance(angles, InterlacedAngles) and angles.passes > 1
         needs = {
-            "one scan at a time; set scan.energies to null": scan.energies is None,
-            "one scan at a time; set scan.states to null": scan.states is None,
+            "a single scan, not a series; set scan.energies to null": scan.energies is None,
+            "a single scan, not a series; set scan.states to null": scan.states is None,
             "a live volume; set recon.live to true": recon.live,
             "a volume that grows during the scan; set recon.reference to null": recon.reference is None,
             "a volume that grows during the scan; set recon.method to r2": streams(recon.method),

@@ -30,7 +30,7 @@ _LONGEST, _MOST, _DEEPEST, _DIGITS = 2**18, 20_000, 64, 500
 """Limits for a YAML text: number of characters, of values (counted as often as aliases repeat them), of nested groups,
 and of digits of a number."""
 _TOO_MUCH = (
-    f"this is more than settings may have: at most {_LONGEST} characters, {_MOST} values, {_DEEPEST} "
+    f"the settings are too large: at most {_LONGEST} characters, {_MOST} values, {_DEEPEST} "
     f"nested groups and numbers of {_DIGITS} digits. Nothing was started."
 )
 _QUOTED = re.compile(r"""(?m)"(?:\\.|[^"\\])*"|'[^']*'|(?:^|(?<=\s))#.*$""")  # and the same for remarks

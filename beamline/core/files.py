@@ -90,7 +90,7 @@ def require_regular(path: Path, largest: float = math.inf) -> None:
         what = "It is a folder" if stat.S_ISDIR(status.st_mode) else "It is a device or a pipe"
         raise OSError(errno.EINVAL, f"{what}, but a regular file is expected", str(path))
     if status.st_size > largest:
-        raise OSError(errno.EFBIG, f"It is too large ({status.st_size} bytes, at most {largest:.0f})", str(path))
+        raise OSError(errno.EFBIG, f"The file is too large ({status.st_size} bytes, at most {largest:.0f})", str(path))
 
 
 _DATA = {b"\x89HDF": "an HDF5 file", b"II*\0": "a TIFF file", b"MM\0*": "a TIFF file", b"PK\3\4": "a .zip or .npz file"}
@@ -143,7 +143,7 @@ def require_below(folder: Path, name: str, largest: float = math.inf) -> Path:
     for part in parts:
         place /= part
         if part == ".." or PurePosixPath(part).is_absolute() or is_link(place):
-            raise OSError(errno.ELOOP, "It is a link, but only files in the folder itself are read", str(place))
+            raise OSError(errno.ELOOP, "The file is a link, but only files in the folder itself are read", str(place))
     place.stat()
     require_regular(place, largest)
     return place
@@ -180,7 +180,7 @@ def text_in(path: Path, largest: int = TEXT) -> str:
         return decoded(path.read_bytes())
     except UnicodeDecodeError as error:
         raise OSError(
-            errno.EILSEQ, f"It is not UTF-8 text: byte {error.start} is not valid. Save it as UTF-8", str(path)
+            errno.EILSEQ, f"The file is not UTF-8 text: byte {error.start} is not valid. Save it as UTF-8", str(path)
         ) from error
 
 

@@ -77,14 +77,15 @@ def installation_problem(error: BaseException) -> str:
         return str(error) if name == "splatline" else ""  # which says all
     cause, origin, package = error.__cause__ or error, _origin(name), _DISTRIBUTIONS.get(name, name)
     if origin is None:
-        advice = f"{sys.executable} does not find it. Install it: pip install {package}"
+        advice = f"{sys.executable} does not find this library. Install it: pip install {package}"
     elif name in sys.stdlib_module_names or not _installed(origin):
         advice = (
-            f"Python finds it at {origin}. If this is a different package, {_way_out(origin)}; otherwise install "
+            f"Python finds a library of this name at {origin}. If this is a different package, {_way_out(origin)}; "
+            f"otherwise install "
             "it again"
         )
     else:
-        advice = f"It is at {origin}. Install it again: pip install --force-reinstall {package}"
+        advice = f"The library is at {origin}. Install it again: pip install --force-reinstall {package}"
     reason = " ".join(f"{type(cause).__name__}: {cause}".split())
     return f"the library {name!r} cannot be loaded ({reason}). {advice}.{_WITHOUT.get(name, '')}"
 
@@ -147,5 +148,5 @@ _AGAIN = "Install it again: `pip install --force-reinstall --no-deps splatline`"
 def _way_out(origin: str) -> str:
     """What the user can do about a module that is not ours."""
     if not _installed(origin):
-        return "rename that one, or work in another folder"
-    return "it belongs to another distribution. Install splatline in a separate environment (python -m venv)"
+        return "rename that file or folder, or work in another folder"
+    return "this package belongs to another distribution. Install splatline in a separate environment (python -m venv)"

@@ -53,7 +53,8 @@ def stop_signals(stop: StopRequest) -> AbstractContextManager[None]:
 
     def keep_on(number: int, frame: FrameType | None) -> None:
         to_stderr(
-            "Use `beamline pause` to pause the scan: it cannot be suspended, because the shutter would stay open."
+            "Use `beamline pause` to pause the scan. This program cannot be suspended, because the shutter would "
+            "stay open."
         )
 
     suspended = {signal.SIGTSTP: keep_on} if hasattr(signal, "SIGTSTP") else {}

@@ -181,7 +181,7 @@ def scene_of(config: Config, energy: float | None = None) -> Scene:
     if energy is not None and isinstance(beam := mapping.get("beam"), dict):
         if wide := [name for name in ("spectrum", "tube") if beam.get(name) is not None]:
             raise ConfigError(
-                f"name energy_kev in simulation.scene.beam instead of {wide[0]}, because a monochromator "
+                f"set energy_kev in simulation.scene.beam instead of {wide[0]}, because a monochromator "
                 "gives a single energy. Nothing was started."
             )
         mapping = mapping | {"beam": beam | {"energy_kev": energy}}

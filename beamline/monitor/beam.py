@@ -65,8 +65,8 @@ class BeamCheck(Logged):
     unit: ClassVar[str] = "fraction of the intensity in the flats"
     meaning: ClassVar[str] = "the beam intensity differs from that in the flats, or from the projections before"
 
-    drift: float = setting(0.02, "fraction by which the beam intensity may drift up or down", ge=0)
-    dip: float = setting(0.10, "fraction of the beam intensity whose sudden loss is an alarm", ge=0, lt=1)
+    drift: float = setting(0.02, "largest allowed drift of the beam intensity, up or down, as a fraction", ge=0)
+    dip: float = setting(0.10, "sudden loss of beam intensity above which there is an alarm, as a fraction", ge=0, lt=1)
 
     start = BeamState
 

@@ -111,9 +111,10 @@ class FieldOfViewCheck(Logged):
     def _cut(self, row: int, edges: tuple[float, float], grid: CellGrid, entered: bool) -> Flag:
         left, right = edges
         cut = {side: depth for side, depth in (("left", left), ("right", right)) if depth > self.edge}
-        beside = " It was inside in earlier projections, so it is off the rotation axis: centre the sample." * (
-            entered and len(cut) == 1
-        )
+        beside = (
+            " The sample was inside the field of view in earlier projections, so it is not centred on the rotation "
+            "axis: centre it."
+        ) * (entered and len(cut) == 1)
         advice = (
             f"{beyond_the_field(cut)}{beside} This has three effects: the check `mass` is switched off, slow floaters "
             "are not detected, and reconstructions are too bright at the rim."

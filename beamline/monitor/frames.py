@@ -190,7 +190,7 @@ class DarkCheck(Logged):
     unit: ClassVar[str] = "counts of drift"
     meaning: ClassVar[str] = "a dark differs from the first one"
 
-    drift: float = setting(5.0, "counts by which a dark may differ from the first dark", ge=0)
+    drift: float = setting(5.0, "largest allowed difference between a dark and the first dark, in counts", ge=0)
 
     start = DarkState
 
@@ -237,7 +237,7 @@ class LostCheck:
     meaning: ClassVar[str] = "the beam is gone"
     policy: ClassVar[Policy] = Policy.STOP
 
-    alarm: float = setting(0.5, "fraction of the intensity whose loss means that the beam is lost", ge=0.5, le=1)
+    alarm: float = setting(0.5, "loss of intensity from which on the beam counts as lost, as a fraction", ge=0.5, le=1)
 
     start = LostState
 

@@ -99,14 +99,14 @@ class OppositeCheck(Logged):
     unit: ClassVar[str] = "pixels"
     meaning: ClassVar[str] = "compared with the opposite projection, or with a repetition, the sample moved or changed"
 
-    warn: float = setting(0.5, "pixels by which the sample may have moved or changed", ge=0)
+    warn: float = setting(0.5, "largest allowed motion or change of the sample, in pixels", ge=0)
     changed: float = setting(
         1.0,
         "change of parts of the sample, in pixels: the shift of the whole sample that would change the projection as "
         "much",
         ge=0,
     )
-    axis: float = setting(1.0, "pixels by which the axis may differ from its stated position", ge=0)
+    axis: float = setting(1.0, "largest allowed distance of the axis from the stated position, in pixels", ge=0)
 
     start = OppositeState
 
@@ -117,7 +117,8 @@ class OppositeCheck(Logged):
         if view is None or grid is None or state.aside or not math.isfinite(view.angle):
             return CheckResult(state)
         if context.cone or not grid.flats:
-            why = "in a cone beam they differ even if the sample is at rest" if context.cone else "there are no flats"
+            cone = "in a cone beam opposite projections differ even if the sample is at rest"
+            why = cone if context.cone else "there are no flats"
             advice = f"Nothing to do: opposite projections are not compared, because {why}."
             return CheckResult(
                 replace(state, aside=True), Flag(self.name, Level.INFO, frame.index, 0.0, self.warn, advice)

@@ -78,7 +78,7 @@ class ReferenceLimits:
     light_over_noise: float = setting(
         3.0, "least intensity of a flat, in units of the noise of a pixel in a dark", ge=0
     )
-    light_gone: float = setting(0.5, "fraction of the intensity of the brightest flats that may be missing", gt=0, lt=1)
+    light_gone: float = setting(0.5, "fraction by which a flat may be darker than the brightest flats", gt=0, lt=1)
     uneven: float = setting(0.1, "relative change of the intensity between flats of a group", gt=0)
     unlit: float = setting(0.5, "fraction of the frame that may be without beam in flats", gt=0, le=1)
     light_in_darks: float = setting(
@@ -158,7 +158,8 @@ def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames
             odd = [same[at] for at in np.flatnonzero(levels - lowest > limit).tolist()]
             least_dark = f"the darkest dark, frame {base.row} with {lowest:.6g}"
             yield BadFrames(odd, float(above.max()), limit, (
-                f"they were exposed to the beam, or their offset changed: they are {range_in_words(above)} counts "
+                f"these darks were exposed to the beam, or the offset changed: the darks are {range_in_words(above)} "
+                f"counts "
                 f"above {least_dark} (limit {limit:.3g}, because the flats have {intensity:.6g} counts of beam)."
             ))  # fmt: skip
 
@@ -177,7 +178,7 @@ def _saturated(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrame
         if all(frame.constant for frame in (*group, *darks)) and not (over.any() and level(darks or group)):
             continue
         if over.any():
-            what = f"{most:.2%} of their pixels are saturated (limit {limit:.2%}), so the intensity is not known"
+            what = f"{most:.2%} of the pixels are saturated (limit {limit:.2%}), so the intensity is not known"
             odd = [group[at] for at in np.flatnonzero(over).tolist()]
             yield BadFrames(odd, most, limit, f"{what}. Shorten the exposure or add a filter.")
         elif all(flat.constant for flat in group):
@@ -199,7 +200,8 @@ def _without_beam(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFr
         intensity = level(group) - level(darks)
         if intensity <= limit * noise:
             yield BadFrames(group, intensity / noise if noise else 0.0, limit, (
-                "they show no beam. Was the shutter open for the flats, and closed for the darks? The level of these "
+                "these flats show no beam. Was the shutter open for the flats, and closed for the darks? The level "
+                "of these "
                 f"flats, {level(group):.6g}, is {intensity:.3g} above that of the darks, {level(darks):.6g}; the noise "
                 f"of a pixel is {noise:.2g} (limit: {limit:g} times the noise)."
             ))  # fmt: skip
@@ -213,7 +215,8 @@ def _beam_lost(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrame
         if (gone > limit).any():
             others, most = spans([flat.row for flat in bright]), float(gone.max())
             sentence = (
-                f"the beam was lost: they have {most:.0%} less intensity than the flats {others} (limit {limit:.0%})."
+                f"the beam was lost: these flats have {most:.0%} less intensity than the flats {others} (limit "
+                f"{limit:.0%})."
             )
             yield BadFrames([group[at] for at in np.flatnonzero(gone > limit).tolist()], most, limit, sentence)
 
@@ -288,7 +291,8 @@ def _beam_in_darks(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadF
         unsure = known and noise < READOUT and level(flats) - level(darks) < FEW * noise
         if min(share, variance) > limit and level(darks) > 0 and not unsure:
             yield BadFrames(darks, min(share, variance), limit, (
-                "they were exposed to the beam. Was the shutter closed for the darks, and open for the flats? The "
+                "these darks were exposed to the beam. Was the shutter closed for the darks, and open for the flats? "
+                "The "
                 f"level of these darks, {level(darks):.6g}, is {share:.0%} of that of the flats, {level(flats):.6g}"
                 + (f", and the variance is {variance:.0%}" if known else "")
                 + f" (limit {limit:.0%})."

@@ -167,7 +167,7 @@ def _without_holes(digest: FrameDigest) -> FrameDigest:
 def _valid(answer: Any, name: str, at: int) -> CheckResult[Any]:
     """The result of a check, after a test that it can be used. Raises TypeError or ValueError if it cannot."""
     if not isinstance(answer, CheckResult) or type(answer.flag) not in (Flag, type(None)):
-        raise TypeError(f"it returned {answer!r:.80}; expected a CheckResult with a Flag or None")
+        raise TypeError(f"the check returned {answer!r:.80}; expected a CheckResult with a Flag or None")
     if (flag := answer.flag) is None:
         return answer
     rows, boxes = (flag.frame if flag.first is None else flag.first, flag.frame), (flag.region, flag.from_region)

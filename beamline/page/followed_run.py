@@ -62,13 +62,13 @@ class RunValues:
     age: float = published("FrameAge", "time since the last frame arrived in the file", math.nan, "s")
     data_rate: float = published("DataRate", "data per second", math.nan, "MB/s")
     residual: float = published("ReconResidual", "projections that the live volume has not used yet", math.nan)
-    skipped: int = published("SkippedLines", "lines of the log that are not events", 0)
+    skipped: int = published("SkippedLines", "messages in the log that are not events", 0)
     angle: float = published("Angle", "of the newest frame in the file", math.nan, "deg")
     flag_names: tuple[str, ...] = published("FlagNames", "checks of the monitor that flagged frames", ())
     flag_counts: tuple[int, ...] = published("FlagCounts", "flags of each check in FlagNames", ())
     pass_number: int = published("PassNumber", "number of the last finished pass of projections, from 1", 0)
     options: tuple[str, ...] = published(
-        "Options", "choices for the measurement after this pass: next, again, wide ...", ()
+        "Options", "what the scan can measure after this pass: next, again, wide ...", ()
     )
     option_gains: tuple[float, ...] = published("OptionGains", "predicted improvement by each of Options", (), "dB")
     option_lows: tuple[float, ...] = published("OptionGainsLow", "lower ends of OptionGains", (), "dB")
@@ -78,7 +78,9 @@ class RunValues:
         "OptionDoses", "dose of each of Options, as a fraction of the dose of the whole plan", (), "%"
     )
     option_sizes: tuple[float, ...] = published("OptionSizes", "data of each of Options", (), "GB")
-    recommended: str = published("Recommended", "the choice in Options that the program makes or would make", "")
+    recommended: str = published(
+        "Recommended", "the recommended choice of Options; a scan that decides by itself takes this choice", ""
+    )
     wait: float = published(
         "AnswerWithin",
         "time left for the operator to decide what is next; 0: the scan does not wait for a decision",

@@ -206,7 +206,7 @@ def remarks(facts: PlanFacts) -> Iterator[str]:
         exposure = plan.exposure / facts.blur_px
         yield (
             f"motion blur is {facts.blur_px:.2f} px at the detector's edge; exposure_s <= {exposure:.3g} or a longer "
-            f"period_s (now {plan.period:g}) keeps it under 1 px"
+            f"period_s (now {plan.period:g}) keeps the blur under 1 px"
         )
     if facts.skew_px > 1:
         yield (
@@ -225,9 +225,12 @@ def remarks(facts: PlanFacts) -> Iterator[str]:
             f"to {plan.retakes} (monitor.retake_share): {facts.retake_seconds:.0f} s and "
             f"{size(facts.retake_bytes)} more at most"
         )
-    yield from _reference("flats", plan.flats, plan.exposure, "their intensity will be scaled")
+    yield from _reference("flats", plan.flats, plan.exposure, "the intensity of the flats will be scaled")
     yield from _reference(
-        "darks", plan.darks, plan.exposure, "their hot pixels and dark current differ from those of the projections"
+        "darks",
+        plan.darks,
+        plan.exposure,
+        "hot pixels and dark current of these darks differ from those of the projections",
     )
 
 
@@ -257,7 +260,7 @@ def _speed(facts: PlanFacts) -> Iterator[str]:
     if facts.views.speed > facts.stage.max_speed * (1 + 1e-9):
         period = facts.plan.period * facts.views.speed / facts.stage.max_speed
         yield (
-            f"the scan needs {degrees(facts.views.speed)}/s, the stage turns at most "
+            f"the scan needs {degrees(facts.views.speed)}/s, but the stage turns at most "
             f"{degrees(facts.stage.max_speed)}/s; set scan.period_s >= {rounded(period, up=True):g} or take more "
             "projections"
         )

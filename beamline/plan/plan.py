@@ -319,7 +319,7 @@ def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
             raise ValueError(f"line {number} contains {word!r}; expected one angle in degrees per line, such as 12.5")
         degrees.append(value)
     if not degrees:
-        raise ValueError("it contains no angle; expected one angle in degrees per line")
+        raise ValueError("the file contains no angle; expected one angle in degrees per line")
     return np.deg2rad(np.array(degrees, dtype=np.float64))
 
 

@@ -250,7 +250,7 @@ def _steady(
         what = f"The intensity of the whole frame {frames[outlier]} differs from its neighbours in angle, by {more}"
     sentence = (
         f"{what}, and there is no air next to the sample to correct this. Intensity, exposure, energy or "
-        "filter changed, or projections of another scan are among them. Use --views to choose "
+        "filter changed, or some projections belong to another scan. Use --views to choose "
         "projections that belong together, or --air to state which columns are air."
     )
     return ConsistencyCondition("light of opposite views", size, _STEP_OF_LIGHT, "in line integral", sentence)
@@ -286,8 +286,8 @@ def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: f
         sentence = (
             f"Look at these frames: {count(int(odd.sum()), 'projection')} of {odd.size} checked "
             f"({frames_text(frames[odd])}) {'differs' if odd.sum() == 1 else 'differ'} from the others by "
-            f"up to {most:+.1%} in total absorption, but {because}. Something else stood in the beam, or "
-            "the intensity is wrong. --views leaves projections out."
+            f"up to {most:+.1%} in total absorption, but {because}. Something else was in the beam, or the intensity "
+            f"is wrong. --views leaves projections out."
         )
         return ConsistencyCondition("mass of the views", float(abs(most)), limit, "of the total absorption", sentence)
     sentence = (
@@ -351,8 +351,8 @@ def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCo
 def _across(shown: ViewMoments) -> ConsistencyCondition:
     left, right = np.percentile(shown.across, _MOST_OF_THEM)
     sentence = (
-        "The sample or the stage moved sideways, or frames have wrong angles: the centre of mass strays "
-        f"by {right - left:.1f} columns (uncertainty {shown.across_sigma:.2g}) from the sine curve of a "
+        f"The sample or the stage moved sideways, or frames have wrong angles: the centre of mass deviates by "
+        f"{right - left:.1f} columns (uncertainty {shown.across_sigma:.2g}) from the sine curve of a "
         "rotating sample. Use --calibrate shifts or --poses to correct it, or --volumes if the sample "
         "changes."
     )
@@ -438,7 +438,8 @@ def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: fl
                 f"The sample changed during the scan: frames {frames[first]} and {frames[later]} measure the "
                 "same rays at two times, and in the later one the sample is "
                 f"{', '.join(np.array(words)[off > 1])}{_SCALED if off[2] > 1 and change[2] * change[3] > 0 else ''}. "
-                "Other such pairs show the same. A single volume blurs everything that changes. Use --volumes N "
+                "Other pairs of such frames show the same change. A single volume blurs everything that changes. Use "
+                "--volumes N "
                 "for several volumes in time, --calibrate shifts if the sample moved as a whole, or --views for "
                 "a part of the scan."
             )

@@ -188,8 +188,8 @@ def _corrected(
     if 2 * (n := projections.view_ids.size) < used.size:
         raise DataError(
             f"{plan.source.path}: only {n} of {used.size} projections can be used, which are too "
-            "few for the scan. The others are without beam, have no finite pixel, or differ from what "
-            "was written. Choose those that can be used with --views, or repeat the others."
+            "few for the scan. The other projections have no beam, have no finite pixel, or differ from their "
+            "checksum. Choose the usable projections with --views, or take the others again."
         )
     return projections
 

@@ -265,7 +265,7 @@ def no_view(scan: ScanEvidence, references: References | None) -> NoViewError:
     beside_flats = (
         ""
         if references is None
-        else f" The brightest have {scan.brightest:.2g} of the intensity of the flats. If the "
+        else f" The brightest projections have {scan.brightest:.2g} of the intensity of the flats. If the "
         "projections were already divided by their flats, give --quantity transmission or "
         "line-integrals."
     )

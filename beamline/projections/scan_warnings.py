@@ -149,13 +149,14 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
         (
             (masked & ~unseen).mean(),
             Note,
-            "of the detector's pixels are dead or hot. They were replaced with values of neighbouring pixels.",
+            "of the detector's pixels are dead or hot. The values of these pixels were replaced with values of "
+            "neighbouring pixels.",
         ),
         (
             corrected.replaced,
             Note,
-            "of the pixels were zingers (bright spots in one projection only) or not finite. They were "
-            "replaced with values of neighbouring pixels.",
+            "of the pixels were zingers (bright spots in one projection only) or not finite. The values of these "
+            "pixels were replaced with values of neighbouring pixels.",
         ),
         (
             corrected.floored,

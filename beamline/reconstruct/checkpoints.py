@@ -158,7 +158,7 @@ def _read_state(path: Path) -> tuple[Checkpoint, FitState]:
             if name not in ("scalars", "watch", "kernel_exponent") and not np.isfinite(values).all():
                 raise ValueError(f"{name} of the checkpoint has values that are not finite")
         if not (np.isfinite(reached.unit) and reached.unit > 0):
-            raise ValueError(f"the density unit of the checkpoint is {reached.unit}")
+            raise ValueError(f"the density unit of the checkpoint must be above 0, but it is {reached.unit}")
     except ValueError as error:
         raise DataError(
             f"The checkpoint {path} is damaged: {error}. Resume from another checkpoint, or start again without "

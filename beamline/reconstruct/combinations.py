@@ -28,9 +28,9 @@ EXCLUDED: Mapping[str, Mapping[str, str]] = MappingProxyType(
         "quality": _BY_SECONDS,
         **dict.fromkeys(("start", "device", "early-stop", "checkpoint", "resume", "allow-negative"), _FINISHED),
         "reference": {
-            "volumes": "a reference helps to reconstruct a single volume",
+            "volumes": "a reference can be used only for a single volume",
             "uncertainty": "error bars are not calibrated for it",
-            "roi": "the motion of the sample is estimated in all of the field",
+            "roi": "the motion of the sample must be estimated in the whole field of view",
         },
         "volumes": {  # volumes in time, or volumes of materials
             **_FINISHED,

@@ -68,7 +68,8 @@ class Estimate(Need):
         if self.seconds is None or self.least_seconds is None:
             return f"not known, because the time of {self.method} cannot be predicted"
         most, least = (f"about {duration_text(seconds)}" for seconds in (self.seconds, self.least_seconds))
-        span = f"{most}; {least} if the data let it stop early" if self.least_seconds < self.seconds else most
+        early = f"{most}; {least} if the method ends early with these data"
+        span = early if self.least_seconds < self.seconds else most
         return f"{span}; reading and correction not counted"
 
 

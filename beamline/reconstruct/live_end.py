@@ -44,8 +44,9 @@ def ended(live: LiveScan, state: Feeds, scan: SelectedScan, usable: UsableViews)
     state = settled(live, state)  # the scan was stopped, so that no other projection comes
     if usable.jumps.size:
         live.warn(
-            f"The sample jumped at {frames_text(usable.jumps)}. The live volume does not correct for it. After the "
-            "scan, run `beamline recon` on the file: it uses the longer part of the scan, before or after the jump."
+            f"The sample jumped at {frames_text(usable.jumps)}. The live volume does not correct for this jump. "
+            f"After the scan, run `beamline recon` on the file: it uses the longer part of the scan, before or after "
+            f"the jump."
         )
     table = live.source.table
     why = _SEVERAL_PARTS if table.part_starts.size > 1 else _OUTDATED if outdated(state.correction) else _OFFSET

@@ -34,8 +34,8 @@ _NEXT_PART = (
     "with the flats of its own part"
 )
 _SHADED = (
-    "Correcting all projections again, because an object is in the beam in all projections, but not in the "
-    "flats: its rays are no longer used"
+    "Correcting all projections again, because an object is in the beam in all projections, but not in the flats: "
+    "rays through this object are no longer used"
 )
 
 

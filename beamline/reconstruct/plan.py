@@ -322,7 +322,8 @@ def _refuse_unfollowed(options: ReconOptions) -> None:
     method, views = options.streaming, options.selection.views
     if not (views == "all" or views.startswith("every:")) or method.steps is not None:
         raise ConfigError(
-            "Leave out --steps, and --views unless it is every:K: --follow uses the projections in the order in which "
+            "Leave out --steps. Also leave out --views, unless it is every:K. The reason: --follow uses the "
+            "projections in the order in which "
             "they are recorded, and fits for --seconds after the end of the scan."
         )
     try:

@@ -52,8 +52,8 @@ def with_reference(
         made = folder / f"{safe_name(path.stem)}_reference.h5"
         if made == options.target.output:
             raise DataError(
-                f"The reference {path.name} is a scan, whose volume would be in {made}, which is also the output. "
-                "Name another output. Nothing was computed."
+                f"The reference {path.name} is a scan. Its volume would be written to {made}, but this is also the "
+                f"output. Name another output. Nothing was computed."
             )
         if _too_few(options):
             return options  # the method reports this, and does not use a reference
@@ -78,7 +78,7 @@ def with_reference(
     try:
         method = with_settings(options.method, {"reference": volume})
     except ValueError as error:
-        raise DataError(f"{path} is no reference: {error}. The state was not reconstructed.") from None
+        raise DataError(f"{path} cannot be used as the reference: {error}. The state was not reconstructed.") from None
     return replace(options, method=method)
 
 

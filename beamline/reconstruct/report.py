@@ -121,8 +121,8 @@ def _footnotes(
         (
             any("air" in values for values in metrics.values()),
             "Air level: mean of the voxels that the projections show to be empty, divided by the standard deviation of "
-            "FBP there. If the air of FBP is below zero, weakly absorbing material of the other volume is too low by "
-            "the same amount.",
+            "FBP there. If the air of FBP is below zero, the densities of weakly absorbing material in the other "
+            "volume are too low by the same amount.",
         ),
         (
             views_grew(result),
@@ -162,14 +162,14 @@ def _further(
     if stray is not None and stray.share > 0:
         yield Picture(
             "Stray mass",
-            "Maximum projection of the density in voxels that the projections show to be empty. All of it is an "
-            "artefact: less is better.",
+            "Maximum projection of the density in voxels that the projections show to be empty. All density in this "
+            "picture is an artefact: less is better.",
             pictures.stray_mass(stray.map, result.volume.grid, prepared.origin.length_unit, VoxelKind.ATTENUATION),
         )
     if facts.references:
         yield Picture(
             "Darks and flats",
-            "As the camera recorded them. Smooth flats are better: dust makes rings if it moves, or if it is "
+            "Frames as the camera recorded them. Smooth flats are better: dust makes rings if it moves, or if it is "
             "only in the flats. If there are two groups of flats, their ratio should be near one everywhere.",
             reference_sheet(facts.references, facts.shape),
         )
@@ -256,9 +256,9 @@ def _doubts(
             "Change since the reference",
             "A slice of the moved reference, of this volume, and of their difference. Red: denser than before, blue: "
             "less dense. Cracks and pores that opened are blue; at edges, thin pairs of red and blue are errors of the "
-            "motion. Last: FBP of what the moved reference leaves of the projections, blurred by a voxel and divided "
-            "by its standard error. Beyond 4 and -4 the projections themselves show a change."
-            + _displaced(result, moved),
+            "motion. The last picture is FBP of the residual (the measured projections minus those of the moved "
+            "reference), blurred by a voxel and divided by its standard error. Beyond 4 and -4 the projections "
+            "themselves show a change." + _displaced(result, moved),
             pictures.change(result.volume, result.change, left, unit, kind),
         )
     if result.deviation is not None:
@@ -273,8 +273,8 @@ def _doubts(
         at = len(unexplained.significance) // 2
         yield Picture(
             "Residual in the projections",
-            "Filtered back-projection of the residual, divided by its noise. It should be even noise, with "
-            "values seldom above 4 or below -4. An edge, crack or pore that is visible here is in the "
+            "Filtered back-projection of the residual, divided by its noise. The picture should show even noise, "
+            "with values seldom above 4 or below -4. An edge, crack or pore that is visible here is in the "
             "projections, but not in the volume. Blue: the volume is too dense, red: not dense enough.",
             pictures.significance(unexplained.significance[at], result.volume.grid, unexplained.first + at, unit),
         )
@@ -319,8 +319,8 @@ def _views(prepared: PreparedProjections) -> Iterator[Picture]:
         moved = geometry.shifts * geometry.sample_pitch
         yield Picture(
             "Poses of the projections",
-            "Shift at the sample, roll and tilt of each projection, against the angle of the stage. They show runout, "
-            "wobble, drift and jumps. `beamline export --poses` writes them as a table.",
+            "Shift at the sample, roll and tilt of each projection, against the angle of the stage. These curves "
+            "show runout, wobble, drift and jumps. `beamline export --poses` writes the values as a table.",
             pictures.pose_curves(np.degrees(geometry.angles), moved, turns, unit),
         )
 

@@ -156,8 +156,9 @@ def not_begun_warning(result: Reconstruction, judgement: Judgement) -> str:
     last = result.history[-1] if result.history else None
     steps = f" after {last.step} of {last.steps} {last.unit or 'steps'}" if last is not None and last.steps else ""
     return (
-        f"Allow more time, steps or iterations: the {label_of(result.method)} volume does not show the sample yet. Its "
-        f"residual, {residual:.3g}, is not smaller than that of a uniform volume, {uniform:.3g} (both as a fraction of "
+        f"Allow more time, steps or iterations: the {label_of(result.method)} volume does not show the sample yet. "
+        f"The residual of this volume, {residual:.3g}, is not smaller than that of a uniform volume, {uniform:.3g} "
+        f"(both as a fraction of "
         f"the variation along detector rows). The method ended after {result.seconds:.3g} s{steps}."
     )
 

@@ -132,7 +132,8 @@ def reference_row(shown: Preview, n_views: int, unit: str) -> PictureRow:
     (moved, volume, change), zoom = _sized((moved, volume, change))
     grey = f"{window[0]:.3g} to {window[1]:.3g} 1/{unit}"
     heading = (
-        f"The moved reference, and FBP of what it leaves of {n_views} projections ({shown.left:.1%} of their norm; "
+        f"The moved reference, and FBP of the residual of {n_views} projections (residual: {shown.left:.1%} of their "
+        f"norm; "
         "the smaller, the better the reference fits)"
     )
     panels = [

@@ -248,7 +248,7 @@ class LiveReconstruction:
         if self._done is None:
             reasons = {
                 ProcessEnd.STOPPED: "it was stopped",
-                ProcessEnd.SILENT: f"it was stopped after {self._silence:.0f} s without output",
+                ProcessEnd.SILENT: f"the process was stopped after {self._silence:.0f} s without output",
             }
             reason = reasons.get(ending, f"it ended with code {process.code}")
             message = f"The {self._what} gave no volume: {reason}. See {self._log.name}. The scan is not affected."

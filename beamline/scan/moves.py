@@ -76,7 +76,7 @@ def looked_again(stage: RotationStage, angle: float, before: float) -> tuple[flo
     if not moving and all(abs(stage.to_counts(place) - wanted) <= most for place in (before, after)):
         return (before + after) / 2, ""
     return after, (
-        f"its frame was exposed while the stage was not at the planned angle of {math.degrees(angle):.4f}°, "
+        f"the frame was exposed while the stage was not at the planned angle of {math.degrees(angle):.4f}°, "
         f"although it had reported its arrival there: it was at {math.degrees(before):.4f}° before the exposure "
         f"and {'is moving ' if moving else ''}at {math.degrees(after):.4f}° after it. {ASTRAY_ADVICE}"
     )
@@ -119,7 +119,7 @@ def require_in_place(looks: dict[str, Callable[[], str]], kind: FrameKind, rows:
     moved = {name: problem for name, look in looks.items() if (problem := look())}
     if moved and rows and not stop.aborting:
         raise InstrumentError(
-            f"{'; '.join(f'{name}: {problem}' for name, problem in moved.items())}. It was moved while "
+            f"{'; '.join(f'{name}: {problem}' for name, problem in moved.items())}. The device was moved while "
             f"{count(len(rows), kind.name.lower())} (frames {spans(list(rows))} of the file) were taken. "
             "Do not use these frames, because it is not known which of them are affected. Find out who "
             "or what moved the device, move it back, and repeat the scan. Frames taken before are good."
@@ -131,7 +131,7 @@ def _wrong_shutter(kind: FrameKind, is_open: bool) -> str:
     if is_open is not (kind is FrameKind.DARK):
         return ""
     wanted, actual = ("closed", "open") if kind is FrameKind.DARK else ("open", "closed")
-    return f"it is {actual}, but {kind.name.lower()}s need it {wanted}"
+    return f"the device is {actual}, but for {kind.name.lower()}s it must be {wanted}"
 
 
 def make_safe(

@@ -191,7 +191,7 @@ class Recorder:
 
     def _refuse_stall(self) -> None:
         if time.monotonic() - self._writing_since > STALL:
-            raise DataError(f"Check the disk: it accepted no frame for {STALL:g} s. {self._safe()}")
+            raise DataError(f"Check the disk, because it accepted no frame for {STALL:g} s. {self._safe()}")
 
     def _raise_failure(self) -> None:
         cause = self._failure

@@ -126,7 +126,10 @@ def _of_block(taken: BlockTally) -> str:
                 "its link."
             )
         if astray := sum(trigger in taken.astray for trigger in taken.missing):
-            text += f" In {astray} of them the stage was not at its angle in any of {TRIES} exposures (invalid rows)."
+            text += (
+                f" In {astray} of the missing projections, the stage was not at its angle in any of {TRIES} "
+                f"exposures (invalid rows)."
+            )
         if taken.ignored:
             text += f" {taken.ignored} triggers were ignored by the camera, which was not ready."
     if untriggered := taken.extra - taken.unconfirmed:

@@ -246,7 +246,7 @@ def write_legend(file: h5py.File) -> None:
     )
     file[REGIONS].attrs["description"] = "first row, row after the last, first column, column after the last; -1: none"
     file[REGIONS].attrs["units"] = "pixel"
-    file[VALID].attrs["description"] = "0: a check raised an alarm; the frame's pixels are as the camera gave them"
+    file[VALID].attrs["description"] = "0: a check raised an alarm. The pixels are stored as the camera delivered them"
     group["bit"].attrs["description"] = "set in flags if the check flagged the frame; alarm_bit: if it raised an alarm"
     group["unit"].attrs["description"] = "of the check's score"
 

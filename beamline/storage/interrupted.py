@@ -105,14 +105,14 @@ def next_step(scan: Path) -> str:
         # if another program writes the file, no lock shows whether that program is alive
         if layout.COMMITTED not in file:
             return (
-                f"It is marked as being written, but has not changed for {QUIET:.0f} s or longer. If the "
+                f"The file is marked as being written, but has not changed for {QUIET:.0f} s or longer. If the "
                 f"program that wrote it has ended, `h5clear -s {scan}` clears the mark."
                 if abandoned(scan)
                 else f"Another program is still writing it: `beamline recon {scan} --follow` reconstructs it "
                 "during the scan."
             )
     if held(scan):
-        return f"Its scan is still running: `beamline recon {scan} --follow` reconstructs it during the scan."
+        return f"The scan is still running: `beamline recon {scan} --follow` reconstructs it during the scan."
     return f"{_died(abandoned(scan))}: `beamline recover {scan}` {_MAKES}."
 
 
@@ -123,25 +123,26 @@ def _step_of_run(run: Path) -> str:
     growing = head is not None and head.open_for_writing
     if lives or held(run / EVENTS, exclusively=True) or (growing and held(scan)):
         return (
-            f"Its scan is still running: `beamline watch {run}` shows it, and `beamline recon {scan} "
+            f"The scan is still running: `beamline watch {run}` shows it, and `beamline recon {scan} "
             "--follow` reconstructs it during the scan."
         )
     if not files_with_frames(run):
-        return "It ended before its first frame: start the scan again."
+        return "The run ended before its first frame: start the scan again."
     ride, resume = is_ride(run), f"`beamline scan --resume {run}` takes the missing projections"
     if growing:
         resume = "" if ride else f"{resume}, "
         return f"{_died(lives is False or abandoned(scan))}: {resume}`beamline recover {run}` {_MAKES}."
     if head is not None and _lacks_views(run):
         return (
-            "It ended early. It recorded the scan of another program, so it cannot be continued."
+            "The run ended early. It recorded the scan of another program, so it cannot be continued."
             if ride
-            else f"It ended early: {resume}."
+            else f"The run ended early: {resume}."
         )
     record = read_record(parts[-1])
     died = record is not None and record.state == DIED
     return (
-        f"Its process was killed after its scan file was closed: `beamline recover {run}` marks the run as ended."
+        f"The process of the run was killed after the scan file was closed: `beamline recover {run}` marks the run "
+        f"as ended."
         if died
         else ""
     )

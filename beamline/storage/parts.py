@@ -214,7 +214,7 @@ def _disagreement(joined: h5py.File, folder: Path) -> str:
             committed = int(file[layout.COMMITTED][()])
             if committed != n:
                 return (
-                    f"its part {part} has {committed} frames instead of the {n} that it had when the parts were joined"
+                    f"the part {part} has {committed} frames instead of the {n} that it had when the parts were joined"
                 )
     others = [other for other in other_parts(parts[0]) if other not in [part.resolve() for part in parts]]
     return f"the frames of {others[0]} are missing" if others else ""

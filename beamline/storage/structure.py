@@ -143,10 +143,10 @@ def shape_of(value: Any, what: str = "shape") -> tuple[int, int, int]:
     """
     sides = tuple(value) if isinstance(value, list | tuple) else ()
     if len(sides) != 3 or any(isinstance(n, bool) or not isinstance(n, int | np.integer) for n in sides):
-        raise ValueError(f"its {what} is {_brief(value)}; expected three integers")
+        raise ValueError(f"the {what} is {_brief(value)}; expected three integers")
     if not all(1 <= n < _LONGEST for n in sides) or math.prod(map(int, sides)) > _MOST:
         raise ValueError(
-            f"its {what} is {_brief(value)}; expected numbers from 1 to 2^31 - 1, and a volume of at most 2^60 bytes"
+            f"the {what} is {_brief(value)}; expected numbers from 1 to 2^31 - 1, and a volume of at most 2^60 bytes"
         )
     z, y, x = map(int, sides)
     return z, y, x
@@ -155,7 +155,7 @@ def shape_of(value: Any, what: str = "shape") -> tuple[int, int, int]:
 def numbers_of(value: Any, n: int, what: str) -> tuple[float, ...]:
     """A tuple of `n` finite numbers. Raises ValueError for anything else."""
     if not isinstance(value, list) or len(value) != n or not all(_is_number(each) for each in value):
-        raise ValueError(f"its {what} is {_brief(value)}; expected {n} numbers")
+        raise ValueError(f"the {what} is {_brief(value)}; expected {n} numbers")
     return tuple(map(float, value))
 
 
@@ -175,7 +175,7 @@ def require_held(shape: tuple[int, int, int], dtype: np.dtype[Any], begin: int, 
     needed = math.prod(shape) * dtype.itemsize
     if begin < 0 or begin + needed > stored:
         raise ValueError(
-            f"its header states {' x '.join(map(str, shape))} voxels from byte {begin} on, but the file "
+            f"the header states {' x '.join(map(str, shape))} voxels from byte {begin} on, but the file "
             f"has {stored} bytes"
         )
 
@@ -189,7 +189,7 @@ def require_npy(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
     needed = file.tell() + math.prod(map(int, shape)) * dtype.itemsize
     file.seek(start)
     if any(n < 0 for n in shape) or needed > stored:
-        raise ValueError(f"its header states the shape {_brief(shape)} of {dtype}, but the file has {stored} bytes")
+        raise ValueError(f"the header states the shape {_brief(shape)} of {dtype}, but the file has {stored} bytes")
     return shape, dtype
 
 

@@ -197,5 +197,5 @@ class WriterWatch:
         if grew or (self._held and now - self._last_frame > self._patience):
             self._last_frame = now
         if self._was_held and not self._held and not finished():
-            return "is no longer being written, because its program ended"
+            return "is no longer being written, because the program that wrote it has ended"
         return f"has not grown for {self._patience:.0f} s" if now - self._last_frame > self._patience else ""

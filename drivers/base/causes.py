@@ -12,10 +12,10 @@ from contextlib import suppress
 from pathlib import Path
 
 _LOADERS = (
-    (r"ELFCLASS(\d+)", "it is a {0}-bit library, and this Python is not {0}-bit", "Use the library for this Python"),
+    (r"ELFCLASS(\d+)", "the library is for {0} bits, but this Python is not", "Use the library for this Python"),
     (
         r"^itself: cannot open|WinError 193|incompatible arch|mach-o",
-        "it was built for another processor; this Python runs on " + sysconfig.get_platform(),
+        "the library was built for another processor; this Python runs on " + sysconfig.get_platform(),
         "Use the library for this processor",
     ),
     (
@@ -30,7 +30,7 @@ _LOADERS = (
     ),
     (
         r"(?:undefined symbol:|symbol not found[^:]*:|version) (\S+)",
-        "it does not match the other libraries on this computer: {0} is missing",
+        "the library does not match the other libraries on this computer: {0} is missing",
         "Install the version made for this operating system",
     ),
     ("", "the file exists but is not a library that can be loaded", "Check the file and the permission to read it"),
@@ -54,11 +54,11 @@ def of_port(url: str, problem: BaseException) -> str:
     rows = (
         (
             number in (errno.EACCES, errno.EPERM) and group != "root",
-            f"It belongs to the group {group}: `sudo usermod -aG {group} $USER`, then log out and in",
+            f"The port belongs to the group {group}: `sudo usermod -aG {group} $USER`, then log out and in",
         ),
         (
             number in (errno.EACCES, errno.EPERM),
-            "This account has no permission to use it: ask the administrator for a udev rule that gives "
+            "This account has no permission to use the port: ask the administrator for a udev rule that gives "
             "it to one of your groups (GROUP, MODE)",
         ),
         (

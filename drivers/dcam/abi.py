@@ -308,7 +308,7 @@ class Dcam:
         try:
             return CaptureState(status.value)
         except ValueError:
-            problem = f"its capture status is {status.value}, which DCAM-API version 4 does not define"
+            problem = f"the capture status of the camera is {status.value}, which DCAM-API version 4 does not define"
             raise DeviceError(
                 self._device,
                 problem,

@@ -113,7 +113,7 @@ class DcamCamera:
         if self._ring is not None:
             raise DeviceRefused(self.name, "it is already armed", advice="disarm() it first")
         if n_frames < 1:
-            raise DeviceRefused(self.name, f"it cannot be armed for less than one frame ({n_frames})")
+            raise DeviceRefused(self.name, f"the camera cannot be armed for less than one frame ({n_frames})")
         self.disarm()  # frees a ring buffer that could not be freed before
         if self._options.trigger_mode is TriggerMode.START:
             apply_trigger_source(self._properties, self._settings.trigger)
@@ -128,7 +128,7 @@ class DcamCamera:
     def software_trigger(self) -> None:
         if self._ring is None or self._settings.trigger is not TriggerSource.SOFTWARE:
             armed = "not armed" if self._ring is None else "armed"
-            problem = f"it does not accept a software trigger ({armed}, trigger {self._settings.trigger})"
+            problem = f"the camera does not accept a software trigger now ({armed}, trigger {self._settings.trigger})"
             raise DeviceRefused(self.name, problem, advice="Configure the trigger as software and arm it")
         self._dcam.cap_firetrigger(self._camera)
 
@@ -263,7 +263,9 @@ class DcamCamera:
         with self._ring_lock:
             ring = self._ring
             if ring is None:
-                raise DeviceRefused(self.name, "it is not armed, so no frame will arrive", advice="arm() it first")
+                raise DeviceRefused(
+                    self.name, "the camera is not armed, so no frame will arrive", advice="arm() it first"
+                )
             state = ring.state()  # read before the ring buffer, so that the last frame is not missed
             try:
                 taken = ring.take()

@@ -181,7 +181,10 @@ def wait_until_cold(
             advice = "Switch the cooler on, or set devices.camera.cool_s: 0"
         elif now >= deadline:
             kind, advice = DeviceTimeout, "Wait longer, or check the camera's fan and cooling water"
-            problem = f"its sensor is not cold after {timeout:g} s: {celsius:.1f} °C, cooler {status.name.lower()}"
+            problem = (
+                f"the sensor of the camera is not cold after {timeout:g} s: {celsius:.1f} °C, cooler "
+                f"{status.name.lower()}"
+            )
         else:
             clock.sleep(min(POLL, deadline - now))
             continue

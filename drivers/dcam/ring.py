@@ -58,7 +58,7 @@ class Ring:
                     reply=self.state().name,
                     expected="BUSY",
                     advice="Switch the camera off and on",
-                    state="It is not armed, and no frame was taken",
+                    state="The camera is not armed, and no frame was taken",
                 )
             clock.sleep(0.001)
 
@@ -75,7 +75,7 @@ class Ring:
         if self._count < before:
             raise DeviceError(
                 self._device,
-                f"its frame counter decreased from {before} to {self._count}",
+                f"the frame counter of the camera decreased from {before} to {self._count}",
                 request="dcamcap_transferinfo",
                 expected="a counter that only increases during a capture",
                 advice="Check that no other program uses the camera, then arm it again",
@@ -122,7 +122,7 @@ class Ring:
             self._overrun_reported = True
             raise DeviceError(
                 self._device,
-                f"its ring of {self._slots} frames was overrun and {lost} frames are lost: frames {first} to "
+                f"the ring buffer of {self._slots} frames was overrun and {lost} frames are lost: frames {first} to "
                 f"{oldest - 1} of this run, in the order of arrival",
                 expected="every frame to be read before the ring buffer overwrites it",
                 advice="Read frames faster, trigger more slowly, or give the ring buffer more memory",
@@ -133,7 +133,9 @@ class Ring:
         """Copy a frame, uint16 [row, col], out of the ring, in which rows may be padded."""
         rows, cols, stride = int(frame.height), int(frame.width), int(frame.row_bytes)
         if not frame.buffer or rows < 1 or cols < 1 or stride < 2 * cols:
-            problem = f"it returned a frame with an impossible layout: {rows} x {cols} pixels, {stride} bytes per row"
+            problem = (
+                f"the camera returned a frame with an impossible layout: {rows} x {cols} pixels, {stride} bytes per row"
+            )
             raise DeviceError(
                 self._device,
                 problem,
@@ -163,7 +165,7 @@ def require_stamps(first: BufFrame, second: BufFrame, device: str) -> None:
         return
     raise DeviceError(
         device,
-        f"its frames have no usable counter and time: framestamps {first.framestamp}, "
+        f"the frames have no usable counter and time: framestamps {first.framestamp}, "
         f"{second.framestamp}, times {seconds_of(first):.6f} s, {seconds_of(second):.6f} s",
         request="2 frames without triggers",
         expected="framestamps that differ by one, and increasing times; otherwise a lost frame cannot be detected",

@@ -122,7 +122,8 @@ class PvShutter(_PvDevice):
                 request=request,
                 reply=f"{self._status.name} is {status}",
                 expected=f"{'' if wanted else 'another value than '}{self._pvs.status_open}",
-                advice="Check its permit, its interlock and the ring, and that this computer has write access",
+                advice="Check the permit and the interlock of the shutter, check that the ring has beam, and that "
+                "this computer has write access",
                 state=NOT_KNOWN,
             )
 
@@ -172,7 +173,7 @@ class PvFilter(_PvDevice):
         if not self._waited(lambda: self.place() == place, self._pvs.travel):
             raise DeviceTimeout(
                 self.name,
-                f"it did not reach {place} within {self._pvs.travel:g} s",
+                f"the filter did not reach {place} within {self._pvs.travel:g} s",
                 request=f"{self._setter.name} = {value}",
                 reply=f"{self._status.name} is {self._status_now()}",
                 expected=f"{value}",
@@ -272,7 +273,7 @@ class PvMonochromator(_PvDevice):
             raise
         raise DeviceTimeout(
             self.name,
-            f"it did not reach {energy:.7g} keV and stay there within {pvs.travel:g} s",
+            f"the monochromator did not reach {energy:.7g} keV and stay there within {pvs.travel:g} s",
             request=f"{self._setter.name} = {wanted:.7g}",
             reply=f"{self._status.name} is {_valid(self._status, self.name)}",
             expected=f"{wanted:.7g}, within {pvs.tolerance * 1e-3 * pvs.per_kev:g}",
@@ -294,7 +295,7 @@ class PvMonochromator(_PvDevice):
         def moved() -> str:
             if self._waited(lambda: self._is_at(before), self._pvs.settle):
                 return ""
-            return f"it was at {before:.7g} keV, and is now at {self.energy():.7g} keV"
+            return f"the monochromator was at {before:.7g} keV, and is now at {self.energy():.7g} keV"
 
         return moved
 

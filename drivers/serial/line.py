@@ -51,7 +51,10 @@ def open_port(url: str, baudrate: int, quiet: float, write_timeout: float) -> An
     return port
 
 
-_SILENT = "Check power, cable and baud rate; the next request first synchronises the line again"
+_SILENT = (
+    "Check power, cable and baud rate; before the next request, the program finds out again which reply "
+    "belongs to which request"
+)
 _SERVER = ". Many terminal servers allow only one client: another program may use this port"
 NEVER = r"(?!)"  # a pattern that does not match any line
 QUIET = 0.05  # s without a byte after which a line counts as silent

@@ -37,7 +37,7 @@ class StageFigures(CheckedSettings):
     stand_in: ClassVar[str] = ""
     """The kind of stage that is simulated instead of this one; "": this kind has its own simulated controller."""
     counts_per_turn: int = setting(
-        doc="Motor pulses or encoder counts per 360 deg; triggers are possible only on whole ones.", gt=0
+        doc="Motor pulses or encoder counts per 360 deg. Triggers are possible only at whole counts.", gt=0
     )
     max_speed: float = setting(unit="deg_s", gt=0)
     acceleration: float = setting(unit="deg_s2", gt=0)

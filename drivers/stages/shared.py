@@ -177,7 +177,7 @@ def while_it_moves(name: str, purpose: str, counts: int, reply: str = "") -> Dev
         f"{purpose} is not possible while it moves",
         reply=reply,
         advice="Wait until the move ends, or stop it",
-        state=f"The current move continues; it is at {counts} counts",
+        state=f"The current move continues; the stage is at {counts} counts",
     )
 
 

@@ -113,7 +113,7 @@ class Travel:
         uneven = train.n > 1 and interval % self.limits.interval_unit != 0
         within = all(self.low <= at <= self.high for at in (train.start, train.end))
         if train.n < 1 or interval == 0 or close or uneven or not within:
-            raise self.cannot_emit(train, advice="Lower max_speed for pulses that are closer together" if close else "")
+            raise self.cannot_emit(train, advice="If pulses must be closer together, lower max_speed" if close else "")
 
     def cannot_emit(self, train: TriggerTrain, why: str = "", advice: str = "") -> DeviceRefused:
         """The error for a train that the stage cannot emit; the message states the conditions for trains."""
@@ -125,7 +125,8 @@ class Travel:
             expected=f"one or more pulses, at least {self.limits.pulse_spacing:g} s apart at full speed, which is "
             f"{least} counts,{multiple} all within {self.span}",
             advice=advice,
-            state="This train is not armed and nothing was sent for it; the stage is where the last move ended",
+            state="Nothing was sent to the stage, and it will send no trigger pulses; the stage is where the last "
+            "move ended",
         )
 
     def refuse_late_arming(self, train: TriggerTrain, counts: int, opening: Fraction | int | None = None) -> None:
@@ -135,14 +136,16 @@ class Travel:
         """
         here = self.degrees(counts)
         if train.interval * (train.start - counts) <= 0:
-            problem = f"it is at {here}, at or past the first pulse at {self.degrees(train.start)}"
-            advice = "Move to a position before the first pulse, then arm"
+            problem = f"the stage is at {here}, at or past the first pulse at {self.degrees(train.start)}"
+            advice = "Move to a position before the first pulse, then prepare the trigger pulses again"
         elif opening is not None and train.interval * (opening - counts) <= 0:
-            problem = f"it is at {here}, at or past {self.degrees(opening)}, where the pulse output opens"
-            advice = f"Move back by at least {self.degrees(abs(train.interval))}, then arm"
+            problem = f"the stage is at {here}, at or past {self.degrees(opening)}, where the pulse output opens"
+            advice = f"Move back by at least {self.degrees(abs(train.interval))}, then prepare the trigger pulses again"
         else:
             return
-        raise DeviceRefused(self.name, problem, advice=advice, state="Nothing has moved and this train is not armed")
+        raise DeviceRefused(
+            self.name, problem, advice=advice, state="Nothing has moved, and the stage will send no trigger pulses"
+        )
 
     def refuse_narrower(self, low: int, high: int, advice: str) -> None:
         """Raise DeviceRefused if the controller's own limits (counts) are narrower than those configured."""
@@ -159,19 +162,19 @@ class Travel:
         """The error for a wait that ended after its timeout (s) before the stage had arrived."""
         return DeviceTimeout(
             self.name,
-            f"it is still moving after {timeout:g} s",
+            f"the stage is still moving after {timeout:g} s",
             request=request,
             reply=reply,
             expected=f"to be at {aim}" if aim else "",
             advice="Allow more time, or stop it",
-            state=f"It was left moving, and is at {self.degrees(counts)}",
+            state=f"The stage was left moving, and is at {self.degrees(counts)}",
         )
 
     def not_stopped(self, timeout: float, counts: int, request: str) -> DeviceTimeout:
         """The error for a stop if the stage has not stopped within `timeout` s."""
         return DeviceTimeout(
             self.name,
-            f"it is still moving {timeout:.1f} s after the stop command",
+            f"the stage is still moving {timeout:.1f} s after the stop command",
             request=request,
             advice="Abort, or use the emergency stop",
             state=f"It is moving, at {self.degrees(counts)}",

@@ -73,11 +73,12 @@ class _FitViews:
     def of(cls, method: Fit, problem: ReconProblem) -> _FitViews:
         if problem.geometry.skew and isinstance(method.gaussians, Gaussians):
             raise ValueError(
-                "a fit whose rows have different angles cannot start from given Gaussians; give their number"
+                "a fit whose rows have different angles cannot start from given Gaussians; give a number of "
+                "Gaussians instead"
             )
         if problem.geometry.width and problem.device != "cpu":
             warnings.warn(
-                f"on {problem.device} the Gaussian fit ignores the width of the rays; only its voxel refinement takes "
+                f"on {problem.device} the Gaussian fit ignores the width of the rays; only the voxel refinement takes "
                 f"{problem.geometry.width} into account",
                 stacklevel=3,
             )

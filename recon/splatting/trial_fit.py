@@ -51,8 +51,9 @@ def predict(method: Fit, trial: Trial, so_far: TrialChoice, prior: Prior) -> Pre
     leads = best is None or significantly_better(trial.in_line_integrals(left), best, so_far.least_gain)
     if so_far.least_gain > 0 and not leads and significantly_better(smooth, left, FAR_BEHIND):
         remark = (
-            f"{method.name} stopped after {FIRST_SHARE:.0%} of its steps, because it was too far behind (a full test "
-            f"takes about {(trial.settings.now() - begin) / FIRST_SHARE:.2g} s; --quality best runs it)"
+            f"{method.name} stopped after {FIRST_SHARE:.0%} of its steps, because its residual was much larger than "
+            f"that of total variation (a full test takes about {(trial.settings.now() - begin) / FIRST_SHARE:.2g} s; "
+            "--quality best runs it)"
         )
     elif not leads:
         tried = _Fit.of(method, trial, 1.0)

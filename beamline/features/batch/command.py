@@ -189,9 +189,9 @@ def _one(row: BatchRow, place: Path, how: Sequence[str], sink: Sink, clock: Cloc
             log.unlink()
             reason = str(last.get("message", "")) or stderr.removeprefix("beamline: ")
             if ending is ProcessEnd.SILENT:
-                reason = f"its process was ended, because it printed nothing for {_SILENCE:g} s"
+                reason = f"the process of this scan was ended, because it printed nothing for {_SILENCE:g} s"
             if code not in _WITH_VOLUME or not (work / RECON).is_file():
-                raise DataError(reason or f"no volume: its process ended with code {code}")
+                raise DataError(reason or f"no volume: the process of this scan ended with code {code}")
         state, why = _WITH_VOLUME[code], [reason] if code else []
     except DataError as error:  # also happens if another program made a folder of this name
         state, why = "failed", [str(error)]

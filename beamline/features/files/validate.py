@@ -54,8 +54,8 @@ def volume_findings(record: ReconRecord) -> Iterator[Finding]:
             low, high = min(low, float(values[finite].min())), max(high, float(values[finite].max()))
     raw, there = record.raw_file, record.parameters.get("partial")
     partial = (
-        f"The volume is partial: {there} are reconstructed, the others are empty. `beamline recon --resume` "
-        "reconstructs the others."
+        f"The volume is partial: {there} are reconstructed, the other slices are empty. `beamline recon --resume` "
+        f"reconstructs these slices."
     )
     early = "The reconstruction was stopped early; the file contains the volume reached by then."
     rules = (
@@ -317,7 +317,9 @@ def time_order(source: ScanSource) -> Iterator[Finding]:
     if source.table.times is not None and (back := np.flatnonzero(np.diff(source.table.times) < 0)).size:
         step = np.diff(source.table.times)[back[0]]
         yield Finding(
-            "error", "time-order", f"Time goes back {back.size} times (first: frame {back[0] + 1}, by {-step:.6g} s)."
+            "error",
+            "time-order",
+            f"The times of the frames go back {back.size} times (first: frame {back[0] + 1}, by {-step:.6g} s).",
         )
 
 

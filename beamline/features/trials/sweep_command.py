@@ -86,7 +86,7 @@ def _values(name: str, text: str) -> tuple[str, ...]:
     first, last, step = map(Decimal, match.groups())
     if step == 0 or (last - first) / step <= 0:
         raise ValueError(
-            f"{name}={text}: a step of {step} does not get from {first} to {last}; expected a step other than 0, "
+            f"{name}={text}: a step of {step} does not lead from {first} to {last}; expected a step other than 0, "
             "with a minus sign if the values fall"
         )
     steps = int((last - first) / step)

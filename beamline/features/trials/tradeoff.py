@@ -81,8 +81,8 @@ def planned_study(
 
 def _note(n_views: int) -> str:
     return (
-        f"PSNR all and SSIM all are against the volume of {REFERENCE} ({n_views}) by the same method and "
-        "settings. They show how much is lost with fewer projections, not which method is better. The reference "
+        f"PSNR all and SSIM all are against the volume of {REFERENCE} ({n_views}) by the same method and settings. "
+        f"Both values show how much is lost with fewer projections, not which method is better. The reference "
         "volume also has noise. A row has part of the same noise, because it uses some of the same projections; "
         "this makes its PSNR all and SSIM all too high. A smoother volume has higher SNR and CNR."
     )

@@ -180,7 +180,8 @@ def _windows(views: ViewSet, width: float, count: int | None) -> ViewChoice:
             label,
             None,
             reason=(
-                f"it needs {max(n, 2)} windows of {w} projections, but the {order.size} projections contain only "
+                f"averaging needs {max(n, 2)} windows of {w} projections, but the {order.size} projections contain "
+                f"only "
                 f"{max(room, 0)} windows"
             ),
         )

@@ -54,8 +54,8 @@ def tune(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: b
                 "A scan would stop with these darks and flats, and no exposure time changes that: see FAULT above."
             )
         raise QualityError(
-            f"Set the exposure to {result.advised:.4g} s: with the present one, a scan would stop at its darks or "
-            "flats."
+            f"Set the exposure to {result.advised:.4g} s: with the present exposure, a scan would stop because of "
+            f"its darks or flats."
         )
 
 

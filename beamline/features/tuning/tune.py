@@ -88,8 +88,8 @@ class Tuning:
             ("dark", f"{self.dark:.5g} counts; noise of a pixel: {self.dark_noise:.3g} counts"),
             (
                 "flat",
-                f"{self.flat:.5g} counts; the brightest thousandth of the pixels has {self.brightest:.5g} of "
-                f"{self.saturation:.5g}, at {self.exposure:.4g} s",
+                f"{self.flat:.5g} counts; the brightest thousandth of the pixels has {self.brightest:.5g} counts "
+                f"(saturation: {self.saturation:.5g}), at {self.exposure:.4g} s",
             ),
             ("saturated", f"{self.saturated:.2%} of the pixels of the flat, at the configured {self.configured:.4g} s"),
             (

@@ -88,8 +88,8 @@ class BandsCheck(Logged):
     alarm: float = setting(
         0.1,
         (
-            "fraction of the intensity that a row or column of the preview may lose, compared with the other rows or "
-            "columns"
+            "largest allowed loss of intensity in a row or column of the preview, compared with the others, as a "
+            "fraction"
         ),
         ge=0,
         lt=1,

@@ -72,7 +72,7 @@ class BlurCheck(Logged):
     unit: ClassVar[str] = "fraction of the fine contrast"
     meaning: ClassVar[str] = "the projection is less sharp than the projections before"
 
-    warn: float = setting(0.3, "fraction of the fine contrast that a projection may lose", ge=0, lt=1)
+    warn: float = setting(0.3, "largest allowed loss of fine contrast, as a fraction", ge=0, lt=1)
 
     start = BlurState
 

@@ -142,8 +142,8 @@ class FloaterCheck(Logged):
             f"Find the particle and blow it off: it crosses the field of view in rows {top * cell} ... "
             f"{below * cell - 1}, frames {after.crumbs[-1].first} ... {crumb.last} so far, and moves "
             f"{abs(track.speed) * cell:.1f} px per projection to the {'right' if track.speed > 0 else 'left'}. No "
-            "point of the rotating sample moves like this, so it is falling, floating or sitting on the holder. "
-            "`beamline recon` gives its rays less weight; repeat the scan if streaks remain."
+            "point of the rotating sample moves like this, so the particle is falling, floating or sitting on the "
+            "holder. `beamline recon` gives rays through the particle less weight; repeat the scan if streaks remain."
         )
         flag = Flag(self.name, Level.WARN, crumb.last, track.score, self.warn, advice, where[0], begin, where[1])
         return CheckResult(after, flag)

@@ -214,7 +214,8 @@ class GhostCheck(Logged):
         region = context.grid.region((rows - 1) / 2, (col + 0.5) * broad, rows, 2 * WIDTHS[0] * cols)
         advice = (
             "Look for something between source and detector that reflects or shadows the beam and moves with the "
-            "stage: a broad shadow or reflection crosses the field of view. It changes the intensity by "
+            "stage: a broad shadow or reflection crosses the field of view. The shadow or reflection changes the "
+            "intensity by "
             f"{intensity:.1%} and moves {abs(trail.speed) * broad * context.grid.cell:.0f} px per projection, faster "
             "than any part of the sample. " + again_by(self.name)
         )

@@ -93,7 +93,8 @@ class Width:
         "auto",
         "Rotation of the stage in degrees: ARC during an exposure, READOUT from the readout of the first "
         "row to that of the last (negative: the last row is read first). auto: from the file of a fly "
-        "scan, if ARC is 1 px or more at the edge of the field of view. none: the stage stands still.",
+        "scan, if ARC is 1 px or more at the edge of the field of view. none: the stage does not turn during an "
+        "exposure.",
         parse=_arc,
         metavar="auto|none|ARC[:READOUT]",
     )

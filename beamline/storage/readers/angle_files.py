@@ -95,7 +95,7 @@ def parse_angles(content: str, name: str, column: str = "", unit: str | None = N
     try:
         text, stated = _column(content.splitlines(), column)
         if (factor := datasets.factor_of(unit or stated, datasets.ANGLE_UNITS)) is None:
-            raise ValueError(f"the unit of its angles is {stated!r}; give --angles-unit deg or rad")
+            raise ValueError(f"the unit of the angles is {stated!r}; give --angles-unit deg or rad")
         return from_text(text, unknown=True) * (factor / datasets.DEGREE)
     except ValueError as error:
         table = ". For a table, FILE::COLUMN names one column: by its name, or its number from 0" * (

@@ -255,7 +255,10 @@ def _measured(
         return value
     source.not_used += (
         NotUsed(
-            where, datasets.text_of(item), "it has no attribute `units`, and in SI units the value is impossible", True
+            where,
+            datasets.text_of(item),
+            "the field has no attribute `units`, and in SI units the value is impossible",
+            True,
         ),
     )
     return None

@@ -70,7 +70,7 @@ def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
         if not field.used:
             doubt = field.matters is not None and field.matters(value, item, source)
         elif value.size not in (1, frames, views.size):
-            why = f"it has {value.size} values, and the scan {frames} frames"
+            why = f"the field has {value.size} values, but the scan has {frames} frames"
         else:
             varying, share = _varying(field, item, source)
             why = _unit_problem(field, value, item, source) or varying
@@ -88,7 +88,7 @@ def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source:
     if field.units is None or not stated or datasets.in_units(item, field.units) is not None:
         return ""
     if value.dtype.kind not in "uifb":
-        return "it is text; expected a number, with a known unit after it or in its attribute `units`"
+        return "the field is text; expected a number, with a known unit after the number or in the attribute `units`"
     unit = datasets.attribute(item, "units")
     return f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
 
@@ -155,7 +155,8 @@ def _disagrees(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> b
 
 
 _ONE = (
-    "it differs between projections, but one value is used for all of them. Images differ in size by up to {:.2g} px "
+    "the value differs between projections, but one value is used for all projections. Images differ in size by up "
+    "to {:.2g} px "
     "at the edge of the field of view. Scale the images about the rotation axis to one pixel size, or state the right "
     "one with --pixel-size-um (cone beam: --cone)"
 )
@@ -170,10 +171,10 @@ _DONE = (
 )
 
 NXTOMO: tuple[Entry, ...] = (
-    Entry("definition", "states the kind of the file, but the structure of the file decides"),
+    Entry("definition", "not needed: the kind of the file is recognised by its structure"),
     Entry("detector/data", "frames [frame, row, col]; the attribute `axes` of NXdata must not state another order"),
     Entry("detector/image_key", "kind of each frame; a frame with an undefined code is invalid"),
-    Entry("detector/image_key_control", "as image_key, with -1 for alignment; it overrides image_key"),
+    Entry("detector/image_key_control", "as image_key, and -1 for an alignment frame; overrides image_key"),
     Entry("detector/count_time", "exposure time of each frame", units=datasets.TIME_UNITS),
     Entry(
         "detector/x_pixel_size",
@@ -182,17 +183,18 @@ NXTOMO: tuple[Entry, ...] = (
     ),
     Entry(
         "detector/y_pixel_size",
-        "height of a pixel, and distance of the slices in a parallel beam; otherwise pixels must be square",
+        "height of a pixel. In a parallel beam, this is also the distance between slices; in other beams, pixels "
+        "must be square",
         units=datasets.LENGTH_UNITS,
     ),
     Entry(
         "sample/x_pixel_size",
-        "width of a pixel at the sample; overrides that of the detector",
+        "width of a pixel at the sample; overrides the width of the detector pixel",
         units=datasets.LENGTH_UNITS,
     ),
     Entry(
         "sample/y_pixel_size",
-        "height of a pixel at the sample; overrides that of the detector",
+        "height of a pixel at the sample; overrides the height of the detector pixel",
         units=datasets.LENGTH_UNITS,
     ),
     Entry(
@@ -202,8 +204,9 @@ NXTOMO: tuple[Entry, ...] = (
     ),
     Entry(
         "instrument/source/distance",
-        "distance from source to sample; its sign and the name of the NXsource do not matter. It makes the beam a "
-        "cone, unless the magnification is below 1 % and all rays of the field of view are parallel to within half a "
+        "distance from source to sample; its sign and the name of the NXsource do not matter. With this distance, "
+        "the beam is a cone, unless the magnification is below 1 % and all rays of the field of view are parallel to "
+        "within half a "
         "pixel",
         units=datasets.LENGTH_UNITS,
     ),
@@ -240,13 +243,13 @@ NXTOMO: tuple[Entry, ...] = (
     ),
     Entry(
         "detector/x_rotation_axis_pixel_position",
-        "its origin is not defined; the axis is found in the projections, or given with --axis",
+        "the origin of this field is not defined; the axis is found in the projections, or given with --axis",
         False,
     ),
-    Entry("detector/y_rotation_axis_pixel_position", "its origin is not defined", False),
+    Entry("detector/y_rotation_axis_pixel_position", "the origin of this field is not defined", False),
     Entry(
         "detector/estimated_cor_from_motor",
-        "its origin is not defined; the axis is found in the projections, or given with --axis",
+        "the origin of this field is not defined; the axis is found in the projections, or given with --axis",
         False,
     ),
     Entry("detector/field_of_view", "the projections show whether it is a half acquisition", False),
@@ -277,7 +280,11 @@ NXTOMO: tuple[Entry, ...] = (
     Entry("sample/y_translation", _POINTS, False, _moves),
     Entry("sample/z_translation", _POINTS, False, _moves),
     Entry("sample/distance", "the sample is assumed to be at the rotation axis", False),
-    Entry("sample/propagation_distance", "it follows from the distances of source and detector", False),
+    Entry(
+        "sample/propagation_distance",
+        "the propagation distance follows from the distances of source and detector",
+        False,
+    ),
     Entry("sample/polar_angle", "the rotation axis is assumed to lie along the columns", False, _true),
     Entry("detector/flatfield_applied", _DONE, False, _true),
     Entry("detector/pixel_mask_applied", "defective pixels are found in the frames", False),
@@ -336,8 +343,8 @@ EXCHANGE: tuple[Entry, ...] = (
     Entry("exchange/data_shift_y", _POSES, False, _shifts),
     Entry("exchange/x", "pixels are assumed to be evenly spaced; x_pixel_size is used", False),
     Entry("exchange/y", "pixels are assumed to be evenly spaced; y_pixel_size is used", False),
-    Entry("measurement/instrument/source/energy", "it is the energy of the ring, not of the photons", False),
-    Entry("measurement/instrument/source/current", "it is one value for the whole scan", False),
+    Entry("measurement/instrument/source/energy", "this is the energy of the ring, not of the photons", False),
+    Entry("measurement/instrument/source/current", "the file has only one value for the whole scan", False),
     Entry(
         "measurement/instrument/detector/exposure_time",
         "exposure time of darks, flats and projections, or of each projection (default unit: seconds)",
@@ -375,7 +382,7 @@ EXCHANGE: tuple[Entry, ...] = (
     ),
     Entry(
         "measurement/instrument/detection_system/objective/resolution",
-        "it is not part of the format; give it with --pixel-size-um",
+        "this field is not part of the format; give the pixel size with --pixel-size-um",
         False,
     ),
     Entry("process/acquisition/rotation/start", "theta is used", False),

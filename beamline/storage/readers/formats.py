@@ -124,5 +124,5 @@ def _unknown(path: Path) -> DataError:
     )
 
 
-_VOLUME = " It may be a volume: `beamline view` shows NIfTI volumes."
+_VOLUME = " The file may be a volume: `beamline view` shows NIfTI volumes."
 _WAYS = {".mat": " Save a .mat with -v7.3.", ".nii": _VOLUME, ".gz": _VOLUME}

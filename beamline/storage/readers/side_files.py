@@ -209,7 +209,7 @@ def _values(path: Path) -> dict[str, str]:
     text, values = _text(path), dict[str, str]()
     if path.suffix.lower() == ".xml":
         if "<!DOCTYPE" in text or "<!ENTITY" in text:
-            raise ValueError("it defines XML entities, which are not read")
+            raise ValueError("the file defines XML entities, which this program does not read")
         _of_element(ElementTree.fromstring(text), "", values)
     elif text.lstrip().startswith("{"):
         _of_json(json.loads(text), "", values)

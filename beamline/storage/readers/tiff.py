@@ -138,7 +138,7 @@ def _of_png(file: IO[bytes], most: float = math.inf) -> NDArray[Any]:
     with Image.open(file, formats=["PNG"]) as picture:
         if not picture.mode.startswith(("L", "I")) or picture.mode == "LA" or 4 * math.prod(picture.size) > most:
             raise ValueError(
-                f"it has {picture.width} x {picture.height} pixels of kind {picture.mode}; expected grey pixels"
+                f"the image has {picture.width} x {picture.height} pixels of kind {picture.mode}; expected grey pixels"
             )
         return np.asarray(picture)
 
@@ -205,7 +205,7 @@ def require_possible(tif: tifffile.TiffFile, most: float = math.inf) -> None:
     first, stored = tif.pages.first, tif.filehandle.size
     claimed = first.nbytes * len(tif.pages)
     if not first.nbytes or claimed > min(most, PACKED * stored) or is_blank(claimed, stored, first.nbytes):
-        raise ValueError(f"its header states {claimed / 1e9:.3g} GB, but the file has {stored} bytes")
+        raise ValueError(f"the header states {claimed / 1e9:.3g} GB, but the file has {stored} bytes")
 
 
 def refuse_packed(tif: tifffile.TiffFile) -> None:
@@ -213,7 +213,7 @@ def refuse_packed(tif: tifffile.TiffFile) -> None:
     bits = tif.pages.first.bitspersample
     if bits > 8 and bits not in (16, 32, 64) and find_spec("imagecodecs") is None:
         raise ValueError(
-            f"its pixels are packed with {bits} bits each: pip install imagecodecs, which unpacks them, "
+            f"the pixels are packed with {bits} bits each: pip install imagecodecs, which unpacks them, "
             "or write the images with 16 bits per pixel"
         )
 

@@ -69,7 +69,7 @@ def altered_sentence(source: ScanSource) -> str:
     rows = np.flatnonzero(source.table.altered).tolist()
     return (
         f"Look for an intact copy of {source.path}: the records of {count(len(rows), 'frame')} (kind, "
-        f"angle, time, trigger) differ from the checksum stored with them: {spans(rows)}. Nothing uses "
+        f"angle, time, trigger) differ from the checksum stored with them: {spans(rows)}. No command uses "
         f"{'this frame' if len(rows) == 1 else 'these frames'}."
     )
 

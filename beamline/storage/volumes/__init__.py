@@ -46,11 +46,12 @@ def entries() -> Registry[FormatEntry]:
         suffixes = tuple(kind().suffixes)
         if not suffixes or taken & set(suffixes) or any(suffix[:1] != "." for suffix in suffixes):
             raise ValueError(
-                f"its suffixes are {suffixes}; expected suffixes such as '.xyz' that are not in use: {sorted(taken)}"
+                f"the suffixes of the format are {suffixes}; expected suffixes such as '.xyz' that are not in use: "
+                f"{sorted(taken)}"
             )
         if getattr(import_module(kind.__module__), kind.__name__, None) is not kind:
             raise ValueError(
-                f"its class {kind.__qualname__} is not defined at the top level of the module {kind.__module__}"
+                f"the class {kind.__qualname__} is not defined at the top level of the module {kind.__module__}"
             )
         taken.update(suffixes)
         return FormatEntry(kind.__module__, kind.__name__, suffixes)

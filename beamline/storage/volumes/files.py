@@ -165,7 +165,7 @@ class Nrrd:
         try:
             facts = marked(notes[0].decode("ascii").replace("\\\\", "\\")) if len(notes) == 1 else None
             if facts is None:
-                raise ValueError(f"its field {_KEY.decode()} was not written by this program")
+                raise ValueError(f"the field {_KEY.decode()} was not written by this program")
             shape = shape_of([int(n) for n in fields[b"sizes"].split()][::-1])
             dtype = dtype_of({32: "<f4", 16: "<u2", 8: "u1"}[kinds[fields[b"type"]]])
             require_held(shape, dtype, begin, path.stat().st_size)

@@ -314,7 +314,7 @@ class NXtomoWriter:
         if now.st_nlink == 0 < self._before.st_nlink:  # if the file system supports hard links
             raise _TouchedError(errno.ENOENT, "it was deleted")
         if now.st_size < self._before.st_size:
-            raise _TouchedError(errno.EIO, f"it was cut from {self._before.st_size} to {now.st_size} bytes")
+            raise _TouchedError(errno.EIO, f"the file was cut from {self._before.st_size} to {now.st_size} bytes")
 
     def _check(self, frame: Frame, digest: FrameDigest) -> None:
         counts, preview = frame.counts, digest.preview
@@ -324,7 +324,7 @@ class NXtomoWriter:
             "an earlier write failed": self._broken,
             f"it is {counts.dtype} {counts.shape}; expected uint16 {self._shape}": unlike,
             f"its preview is {preview.shape}; expected {self._preview_shape}": preview.shape != self._preview_shape,
-            f"its index is {frame.index}; expected {self._rows}, the next row": frame.index != self._rows,
+            f"the index of the frame is {frame.index}; expected {self._rows}, the next row": frame.index != self._rows,
         }
         if wrong := next((fault for fault, there in faults.items() if there), ""):
             raise DataError(

@@ -51,7 +51,8 @@ class EpicsSettings(StageFigures):
     active_high: ClassVar[bool] = True
     """There is no cable; only checks of trigger pulses need one."""
     unit: str = setting(
-        "deg", "Unit of the record (EGU). A linear axis has mm; every key with deg in its name then means mm."
+        "deg",
+        "Unit of the record (EGU). For a linear axis the unit is mm, and every key with deg in its name is then in mm.",
     )
     search: Search = setting(
         Search.NONE, "How `beamline home` searches the reference: none, forward (HOMF) or reverse (HOMR)."
@@ -82,7 +83,7 @@ FAULTS = {  # bit of MSTA: its meaning, and advice
         "Check the controller, and read the messages in the IOC's shell",
     ),
     0x1000: ("the IOC has no contact with its controller", "Check the controller's power and its cable to the IOC"),
-    0x0040: ("it slipped or stalled", "Find what blocks it before you move it again"),
+    0x0040: ("it slipped or stalled", "Find what blocks the stage before you move it again"),
     0x0004: ("it is at its upper limit switch", "Move it away from the switch by hand or in the record's own screen"),
     0x2000: ("it is at its lower limit switch", "Move it away from the switch by hand or in the record's own screen"),
 }
@@ -294,7 +295,7 @@ class EpicsStage(LineStage):
         """Read values. Raises an error for a value that the IOC does not guarantee."""
         values = self._channel.read(*suffixes)
         for suffix, value in zip(suffixes, values, strict=True):
-            refuse_invalid(self.name, self._channel.name + suffix, value, "It is not known whether it is moving")
+            refuse_invalid(self.name, self._channel.name + suffix, value, "It is not known whether the stage is moving")
         return values
 
     def _standing(self, purpose: str) -> None:
@@ -339,10 +340,13 @@ class EpicsStage(LineStage):
         if unit.value != settings.unit:
             wrong, advice = f"its unit (EGU) is {unit.value!r}, expected {settings.unit!r}", "Correct unit or EGU"
         elif abs(abs(float(step.value)) * per_unit - 1) > 1e-6:
-            wrong = f"its step (MRES) is {step.value:g} {settings.unit}, expected {1 / per_unit:g}"
+            wrong = f"the step of the motor record (MRES) is {step.value:g} {settings.unit}, expected {1 / per_unit:g}"
             advice = "Set counts_per_turn to 360 / MRES"
         elif 0 < float(fastest.value) < greatest * (1 - 1e-9):
-            wrong = f"its maximum speed (VMAX) is {fastest.value:g}, below {greatest:g} {settings.unit}/s"
+            wrong = (
+                f"the maximum speed of the motor record (VMAX) is {fastest.value:g}, below {greatest:g} "
+                f"{settings.unit}/s"
+            )
             advice = "Set max_speed_deg_s to VMAX or less"
         if wrong:
             problem = f"the record {self._channel.name} does not fit: {wrong}"

@@ -223,7 +223,7 @@ class PiGcsAxis:
         own = Fraction(numerator) / Fraction(denominator) * 360
         if own == 0 or (own / self._counts_per_turn).denominator != 1:
             raise self._refused(
-                f"it has {float(own):.10g} counts per turn, which is not a multiple of the configured "
+                f"the controller has {float(own):.10g} counts per turn, which is not a multiple of the configured "
                 f"{self._counts_per_turn}",
                 "Correct counts_per_turn in the configuration, or the controller's parameters 0xE and 0xF",
             )

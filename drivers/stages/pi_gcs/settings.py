@@ -64,7 +64,8 @@ def window_of(train: TriggerTrain, first_pulse: PiFirstPulse) -> TriggerWindow:
     step = max(abs(train.interval), 2) if alone else abs(train.interval)
     if first_pulse is PiFirstPulse.GRID and train.start % step:
         raise ValueError(
-            f"this controller sends pulses only at integer multiples of {step} counts, and {train.start} is not one"
+            f"this controller sends pulses only at integer multiples of {step} counts, but the first pulse is at "
+            f"{train.start} counts"
         )
     before = {PiFirstPulse.AT_THRESHOLD: Fraction(0), PiFirstPulse.STEP_AFTER: Fraction(step)}
     lead = before.get(first_pulse, Fraction(step, 2))
@@ -114,7 +115,8 @@ class PiGcsSettings(Wiring, StageFigures):
     axis: str = setting("1", "1 to 16 letters, digits and _", pattern=AXIS_NAME)
     serial: str | None = setting(
         None,
-        "Its serial number, as in *IDN?; the driver stops with an error if another device answers. null: accept any.",
+        "Serial number of the controller, as in *IDN?; the driver stops with an error if another device answers. "
+        "null: accept any.",
     )
     trigger_line: int = setting(1, "Digital output of the trigger pulses.", gt=0)
     reference: Reference = setting(Reference.SWITCH, "Switch at which the search for the reference ends.")
@@ -128,7 +130,10 @@ class PiGcsSettings(Wiring, StageFigures):
         10, "Largest distance from the target at which a move counts as arrived.", unit="counts", ge=0
     )
     settle: float = setting(
-        1.0, "Wait after a move, during which the controller may still settle on the target.", unit="s", ge=0
+        1.0,
+        "Time that the driver waits after a move, because the controller may still settle on the target.",
+        unit="s",
+        ge=0,
     )
 
     def __post_init__(self) -> None:

@@ -284,7 +284,7 @@ class PM16CChannel:
         if number is not None and (int(number[1]), int(number[2])) < STATUS_SINCE:
             raise DeviceRefused(
                 self._name,
-                f"its firmware {number[1]}.{number[2]} cannot report the status of one channel (STSx?)",
+                f"the firmware {number[1]}.{number[2]} cannot report the status of one channel (STSx?)",
                 request="VER?",
                 reply=version,
                 expected="{}.{} or later".format(*STATUS_SINCE),

@@ -37,7 +37,7 @@ FAULTS = {
     "FV": Meaning("supply voltage out of range, driver off", "Check the power supply"),
     "FO": Meaning("driver disabled", "Find who disabled it, then `driver enable` with the vendor's software"),
     "FC": Meaning("inrush current too high", "Check the motor's cable and the power supply"),
-    "FM": Meaning("motor too hot", "Let it cool down; use a lower speed or load"),
+    "FM": Meaning("motor too hot", "Let the stage cool down; use a lower speed or load"),
     "FD": Meaning(
         "driver disabled", "Find the cause of an earlier fault, then `driver enable` with the vendor's software"
     ),
@@ -49,7 +49,7 @@ FAULTS = {
     "FB": Meaning("stream bounds", "Find which program runs a stream on this controller"),
     "FP": Meaning("left its path", "Find which program runs an interpolated move on this controller"),
     "FE": Meaning("limit error", "Find why the stage ran into a limit, then search the reference"),
-    "FT": Meaning("twisted too far", "Turn it back until the cables are straight"),
+    "FT": Meaning("twisted too far", "Turn the stage back until the cables are straight"),
 }
 """Flags of faults; the motor driver may be off."""
 ENDINGS = {

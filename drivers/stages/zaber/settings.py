@@ -41,14 +41,14 @@ class ZaberSettings(Wiring, StageFigures):
     axis: int = setting(1, ge=1, le=9)
     serial: str | None = setting(
         None,
-        "Its serial number (system.serial); the driver stops with an error if another device answers. "
+        "Serial number of the device (system.serial); the driver stops with an error if another device answers. "
         "null: accept any.",
     )
     output: int = setting(1, "Digital output of the trigger pulses.", gt=0)
     toggle: bool = setting(
         False,
-        "true: each fire of a trigger toggles the output (for firmware without `schedule`). Every second fire begins "
-        "a pulse, and intervals must be even.",
+        "true: each time the trigger fires, the output changes its level (for firmware without `schedule`). Every "
+        "second firing begins a pulse, so intervals must be even.",
     )
     speed_unit: float = setting(
         SPEED_UNIT,
@@ -67,7 +67,9 @@ class ZaberSettings(Wiring, StageFigures):
     )
     starter: int = setting(1, gt=0)
     repeater: int = setting(2, "Number of one of the two triggers used.", gt=0)
-    shortest: float = setting(SHORTEST, "Shortest time between two fires of a trigger at full speed.", unit="s", gt=0)
+    shortest: float = setting(
+        SHORTEST, "Shortest time after which a trigger can fire again, at full speed.", unit="s", gt=0
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -138,7 +138,7 @@ class ZaberStage(LineStage):
                 f"its firmware {self._identity['firmware']} has no triggers",
                 expected="7.06 or later",
                 advice="Update the firmware with the vendor's software",
-                state="Nothing has moved and this train is not armed",
+                state="Nothing has moved, and the stage will send no trigger pulses",
             )
         stops, counts = self._stops.count, self._axis.standing("arming").counts
         self._travel.refuse_late_arming(train, counts)
@@ -229,7 +229,7 @@ class ZaberStage(LineStage):
                 self.name,
                 f"the triggers cannot be set up: {problem.problem}",
                 advice=ADVICE,
-                state="This train is not armed",
+                state="The stage will send no trigger pulses",
             ) from problem
         self._train = train
 
@@ -258,7 +258,7 @@ class ZaberStage(LineStage):
         if own is None or float(own) != self.limits.counts_per_turn:
             raise DeviceRefused(
                 self.name,
-                "it has no limit.cycle.dist, so it is not a rotary stage"
+                "the device has no limit.cycle.dist, so it is not a rotary stage"
                 if own is None
                 else f"a turn has {own} microsteps",
                 expected=f"{self.limits.counts_per_turn} a turn, as configured",

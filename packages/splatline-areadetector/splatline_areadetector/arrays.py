@@ -102,7 +102,7 @@ def array_frame(value: Any, received: float, is_current: bool = False) -> ArrayF
     _refuse_colour(attributes, sizes)
     if codec and codec not in NAMES:
         raise FrameRefusedError(
-            f"its pixels are compressed with {codec}, which "
+            f"the pixels are compressed with {codec}, which "
             + ("changes the counts" if codec == "jpeg" else "this program cannot decode")
             + f"; set Codec1:Compressor to one of {', '.join(NAMES)}, or take the image before that plugin"
         )
@@ -131,17 +131,17 @@ def _refuse_colour(attributes: Mapping[str, Any], sizes: list[int]) -> None:
     if mode != _MONO or len(sizes) != 2:
         what = _COLOURS.get(mode, f"ColorMode {mode}") if mode != _MONO else f"in {len(sizes)} dimensions"
         raise FrameRefusedError(
-            f"its pixels are {what}, expected mono; set cam1:ColorMode to Mono (if the array is 3D, an earlier plugin "
+            f"the pixels are {what}, expected mono; set cam1:ColorMode to Mono (if the array is 3D, an earlier plugin "
             f"makes it 3D)"
         )
 
 
 def _refuse_type(dtype: np.dtype[Any], codec: str, element: str) -> None:
     if codec and not element:
-        raise FrameRefusedError(f"its codec {codec} does not state the type of the pixels")
+        raise FrameRefusedError(f"the codec {codec} does not state the type of the pixels")
     if dtype not in COUNTS:
         raise FrameRefusedError(
-            f"its pixels are {dtype}, but they must be uint8 or uint16; set cam1:DataType (or the DataType of the last "
+            f"the pixels are {dtype}, but they must be uint8 or uint16; set cam1:DataType (or the DataType of the last "
             "plugin that changes pixels, such as Proc1) to UInt16"
         )
 
@@ -150,7 +150,8 @@ def _refuse_size(shape: tuple[int, int], dtype: np.dtype[Any], codec: str, pixel
     n_bytes = dtype.itemsize * math.prod(shape)
     if not 0 < n_bytes <= MOST_BYTES or not (codec or pixels.nbytes == n_bytes):
         raise FrameRefusedError(
-            f"it has {pixels.nbytes} bytes, which does not match its dimensions, {shape[0]} x {shape[1]} {dtype}, or "
+            f"the frame has {pixels.nbytes} bytes, which does not match the dimensions, {shape[0]} x {shape[1]} "
+            f"{dtype}, or "
             f"is more than {MOST_BYTES >> 20} MB"
         )
 
@@ -201,7 +202,7 @@ def decoded(codec: str, payload: NDArray[np.uint8], shape: tuple[int, int], dtyp
     n_bytes = dtype.itemsize * shape[0] * shape[1]
     held = int.from_bytes(payload[4:8].tobytes(), "little") if codec == "blosc" else _MOST_RATIO * payload.nbytes
     if held < n_bytes:
-        raise ValueError(f"its {codec} pixels cannot be decoded (there are fewer than {shape[0]} x {shape[1]})")
+        raise ValueError(f"the {codec} pixels cannot be decoded (there are fewer than {shape[0]} x {shape[1]})")
     chunk = payload.tobytes()
     if not chunk.startswith(struct.pack(">Q", n_bytes)):  # pvapy's simulator sends chunks with their header
         chunk = with_header(chunk, n_bytes, dtype.itemsize)
@@ -211,4 +212,4 @@ def decoded(codec: str, payload: NDArray[np.uint8], shape: tuple[int, int], dtyp
             frame.id.write_direct_chunk((0, 0), chunk)
             return frame[()].astype(dtype, copy=False)
     except (OSError, RuntimeError) as error:
-        raise ValueError(f"its {codec} pixels cannot be decoded ({error})") from error
+        raise ValueError(f"the {codec} pixels cannot be decoded ({error})") from error

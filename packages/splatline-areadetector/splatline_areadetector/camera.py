@@ -41,7 +41,7 @@ class AreaDetectorSettings:
     min_period: float = setting(0.0, "Shortest time between two triggers.", unit="s", ge=0, le=100)
     dead: float = setting(
         0.0,
-        "Dead time between two exposures; readout_s if the camera cannot expose during readout.",
+        "Dead time between two exposures. Give the value of readout_s if the camera cannot expose during readout.",
         unit="s",
         ge=0,
         le=100,
@@ -123,7 +123,9 @@ class AreaDetectorCamera:
         """
         self._require_open()
         if self._armed:
-            raise DeviceRefused(self.name, "it cannot be configured while it is armed", advice="disarm() it first")
+            raise DeviceRefused(
+                self.name, "the camera cannot be configured while it is armed", advice="disarm() it first"
+            )
         try:
             self.timing_of(self._own, settings)
         except ValueError as error:
@@ -146,7 +148,7 @@ class AreaDetectorCamera:
         if self._armed:
             raise DeviceRefused(self.name, "it is armed already", advice="disarm() it first")
         if n_frames < 1:
-            raise DeviceRefused(self.name, f"it cannot be armed for less than one frame ({n_frames})")
+            raise DeviceRefused(self.name, f"the camera cannot be armed for less than one frame ({n_frames})")
         labels, trigger = self._labels, self._settings.trigger
         self._await_silence()
         by_pulse = trigger is TriggerSource.EXTERNAL
@@ -176,7 +178,7 @@ class AreaDetectorCamera:
         """Expose one frame. Raises DeviceRefused: not armed, or configured for another trigger."""
         if not self._armed or self._settings.trigger is not TriggerSource.SOFTWARE:
             armed = "armed" if self._armed else "not armed"
-            problem = f"it cannot take a software trigger now ({armed}, trigger {self._settings.trigger})"
+            problem = f"the camera cannot take a software trigger now ({armed}, trigger {self._settings.trigger})"
             raise DeviceRefused(self.name, problem, advice="Configure the trigger as software and arm it")
         if self._labels.fire:
             self._records.write(f"cam1:{self._labels.fire}", 1)
@@ -196,7 +198,9 @@ class AreaDetectorCamera:
         with self._changed:
             self._changed.wait_for(lambda: self._ring or self._lost or self._problem or not self._armed, timeout)
             if not self._armed:
-                raise DeviceRefused(self.name, "it is not armed, so no frame will come", advice="arm() it first")
+                raise DeviceRefused(
+                    self.name, "the camera is not armed, so no frame will come", advice="arm() it first"
+                )
             lost, self._lost = self._lost, 0
             if lost:
                 raise DeviceError(
@@ -265,7 +269,8 @@ class AreaDetectorCamera:
         if (rows, cols) != tuple(self._own.sensor):
             raise DeviceRefused(
                 self.name,
-                f"its sensor has {rows} x {cols} pixels, but devices.camera.sensor states {list(self._own.sensor)}",
+                f"the sensor of the camera has {rows} x {cols} pixels, but devices.camera.sensor states "
+                f"{list(self._own.sensor)}",
                 advice="Correct `sensor`, or `prefix` if it is another camera", state="Nothing was set",
             )  # fmt: skip
 
@@ -330,7 +335,7 @@ class AreaDetectorCamera:
                 self._take_frame(item)
 
     def _fail(
-        self, problem: str, advice: str = "", state: str = "It is still armed, and frames taken before are good"
+        self, problem: str, advice: str = "", state: str = "The camera is still armed, and frames taken before are good"
     ) -> None:
         self._problem = DeviceError(self.name, problem, advice=advice, state=state)
 
@@ -338,7 +343,7 @@ class AreaDetectorCamera:
         shape = self.timing_of(self._own, self._settings).shape
         if item.window.shape != shape:
             self._fail(
-                f"its frames have {item.window.shape[0]} x {item.window.shape[1]} pixels, but {shape[0]} x {shape[1]} "
+                f"the frames have {item.window.shape[0]} x {item.window.shape[1]} pixels, but {shape[0]} x {shape[1]} "
                 "were "
                 "set", "Check Pva1:NDArrayPort: it may name a plugin that bins or crops",
             )  # fmt: skip

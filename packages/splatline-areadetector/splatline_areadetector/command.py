@@ -172,7 +172,7 @@ def _raise_worst(
     """
     n = n_whole + len(lacking)
     recorded = f"{count(n, 'scan')} before this one" if ended else count(n, "scan")
-    recorded = f"Recorded: {recorded}; in {len(lacking)} of them frames are missing."
+    recorded = f"Recorded: {recorded}; in {len(lacking)} of these scans, frames are missing."
     if lacking:
         raise LedgerError(" ".join(filter(None, (str(ended), recorded, "The last of these:", str(lacking[-1])))), [])
     if isinstance(ended, BeamlineError):

@@ -88,10 +88,10 @@ class Counters:
         if dropped:
             return f"by the plugin {self.plugin.prefix}, whose queue was full (DroppedArrays rose by {dropped:.0f})"
         if counted is None:
-            return "before they arrived here (no counter of the IOC shows where)"
+            return "before this program received them (no counter of the IOC shows where)"
         if counted > len(gap.ids):
             return (
-                "after the plugin had sent them: in the network, or in the server's queue for this program "
+                "between the plugin and this program: in the network, or in the server's queue for this program "
                 "(ride.queue_s)"
             )
         return f"by the camera or its driver, before the plugin {self.plugin.prefix}"
@@ -163,7 +163,10 @@ def silence_sentence(counters: Counters) -> str:
     if plugin.text("EnableCallbacks_RBV") == "Disable":
         return f"{plugin.prefix}EnableCallbacks is Disable; set it to Enable"
     if camera is None:
-        return "the camera waits for triggers, or does not acquire (set ride.camera, and the next message says which)"
+        return (
+            "the camera waits for triggers, or does not acquire (if you set ride.camera, this message says which "
+            "of the two)"
+        )
     if camera.text("ArrayCallbacks_RBV") == "Disable":
         return f"{camera.prefix}ArrayCallbacks is Disable; set it to Enable"
     state = camera.text("DetectorState_RBV")

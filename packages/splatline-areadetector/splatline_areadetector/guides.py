@@ -40,8 +40,10 @@ _WORDS = {
     **LOCATIONS, "darkfield": FrameKind.DARK, "flatfield": FrameKind.FLAT, "projection": FrameKind.PROJECTION,
     "dark": FrameKind.DARK, "flat": FrameKind.FLAT, "white": FrameKind.FLAT,
 }  # fmt: skip
-EXPOSURE = "AcquireTime"
-"""Attribute with the exposure time of a frame, s."""
+EXPOSURE = (
+    "AcquireTime"
+    """Attribute with the exposure time of a frame, s."""
+)
 _VIEWS = FrameKind.PROJECTION
 _BEFORE, _AFTER = (Place.START, Place.BOTH), (Place.END, Place.BOTH)
 _POLL = 0.1  # s between two reads of a growing file
@@ -209,7 +211,10 @@ class PandaGuide(_ByNumbers):
             return f"{self._path} {'has no rows' if self._path.exists() else 'does not exist'} yet"
         ends = " to ".join(f"{math.degrees(self._radians(i)):.6g}°" for i in (0, -1))
         rows = count(self._rows.size, "row")
-        return f"{self._path} has {rows}, {ends}: the angles of this scan, unless the file is rewritten"
+        return (
+            f"{self._path} has {rows}, {ends}. These are the angles of this scan, unless the PandABox writes the "
+            f"file again"
+        )
 
     def plan(self) -> RidePlan:
         self._rows, self._waited_at, deadline = np.empty(0), -1, time.monotonic() + self._wait

@@ -48,7 +48,7 @@ class FrameFile:
         try:
             self._file = h5py.File(path, "x", libver=("v110", "v110"))
         except OSError as error:
-            why = "it already exists, and this program does not overwrite files" if path.exists() else f"{error}"
+            why = "the file already exists, and this program does not overwrite files" if path.exists() else f"{error}"
             raise DataError(f"{path} cannot be made: {why}.") from error
         self._data = self._file.create_dataset(
             "/entry/instrument/detector/data", (0, *shape), dtype, maxshape=(None, *shape), chunks=(1, *shape)

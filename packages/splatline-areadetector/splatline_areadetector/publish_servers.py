@@ -49,7 +49,8 @@ class ImageServer:
             from p4p.server.thread import SharedPV
         except ImportError as error:
             raise ConfigError(
-                f'Install p4p: pip install "splatline[epics]". It cannot be loaded ({error}). Nothing was started.'
+                f'Install p4p: pip install "splatline[epics]". The package cannot be loaded ({error}). Nothing was '
+                "started."
             ) from error
         self.name, self._type = name, NTNDArray()
         self._image = SharedPV(initial=self._type.type())
@@ -130,7 +131,8 @@ class RecordServer:
             from softioc import asyncio_dispatcher, builder, softioc
         except ImportError as error:
             raise ConfigError(
-                f"Install softioc for publishing: pip install softioc. It cannot be loaded ({error}). Nothing was "
+                f"Install softioc for publishing: pip install softioc. The package cannot be loaded ({error}). "
+                f"Nothing was "
                 "started."
             ) from error
         self._records: dict[str, Any] = {}

@@ -344,7 +344,7 @@ class RiddenFrames:
         angles, basis, n = self._plan.angles, self._sorter.basis, self._sorter.n_left
         if n == 0 or not self._views or basis.is_sure or (basis is Basis.WAITED and not ended):
             return ""
-        off = f"all angles are those of projections {n} later"
+        off = f"the true angle of each projection is that of the projection {n} places later"
         if n < angles.size and not np.isnan(angles).any():
             off = f"all angles are {math.degrees(angles[n] - angles[0]):.4g}° larger than stated"
         has_angles = self._plan.angle_source == "attribute"
@@ -357,7 +357,7 @@ class RiddenFrames:
             off = f"{off}, which rotates the volume and changes nothing else. Set ride.camera"
         return (
             f"The number of the first projection is not known, so the missing {'frame' if n == 1 else f'{n} frames'} "
-            f"may be the first: then {off} or ride.first_id to avoid this."
+            f"may be the first of the scan. If so, {off} or ride.first_id to avoid this."
         )
 
     def _raise_outcome(self) -> None:

@@ -292,7 +292,10 @@ class Sorter:
         if block.closed or seen.count_restarts != block.count_restarts or trigger >= block.n:
             return self._outside(seen, block)
         if rest:
-            return Unknown(f"numbers rise by {block.step}, but its number is between two of them")
+            return Unknown(
+                f"the numbers of frames rise by {block.step}, but the number of this frame is between two of these "
+                "numbers"
+            )
         skipped, block.last = range(block.trigger(block.last) + 1, trigger), seen.number
         block.triggers.add(trigger)
         if seen.reconnected and not self._note and len(block.triggers) > 1:

@@ -206,7 +206,8 @@ class FrameStream:
             ) from None
         except RemoteError as error:
             raise ConfigError(
-                f"The server of {self.name} does not let us read it: {error}. Nothing was started."
+                f"The server of {self.name} does not allow this program to read the image: {error}. Nothing was "
+                f"started."
             ) from None
 
     def _start(self) -> None:

@@ -150,7 +150,7 @@ def test_a_lost_frame_leaves_a_gap(spinnaker: FakeIoc) -> None:
 
 
 def test_another_sensor_than_configured_is_refused(spinnaker: FakeIoc) -> None:
-    with pytest.raises(DeviceRefused, match=r"its sensor has 256 x 320 pixels, but .*sensor states \[512, 320\]"):
+    with pytest.raises(DeviceRefused, match=r"sensor of the camera has 256 x 320 pixels, but .*states \[512, 320\]"):
         spinnaker.camera(sensor=(512, 320))
 
 

@@ -102,8 +102,8 @@ def test_window_and_attributes() -> None:
     ("changed", "sentence"),
     [
         ({"codec": {"name": "zfp", "parameters": 6}}, "with zfp, which this program cannot decode; set Codec1:Comp"),
-        ({"codec": {"name": "blosc", "parameters": 0}}, "its codec blosc does not state the type of the pixels"),
-        ({"attributes": {"ColorMode": 1}}, "its pixels are Bayer, expected mono"),
+        ({"codec": {"name": "blosc", "parameters": 0}}, "the codec blosc does not state the type of the pixels"),
+        ({"attributes": {"ColorMode": 1}}, "the pixels are Bayer, expected mono"),
     ],
 )
 def test_what_is_no_frame_of_counts(changed: dict[str, Any], sentence: str) -> None:

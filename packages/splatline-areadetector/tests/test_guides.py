@@ -221,7 +221,10 @@ def test_a_pandaboxs_file_that_is_there_says_what_it_has(tmp_path: Path, data: A
     with h5py.File(tmp_path / "panda.h5", "w") as file:
         file["INENC1.VAL.Value"] = data
     guide = _panda(tmp_path, **angles)
-    assert f"panda.h5 has 20 rows, {ends}: the angles of this scan, unless the file is rewritten" in guide.status
+    assert (
+        f"panda.h5 has 20 rows, {ends}. These are the angles of this scan, unless the PandABox writes the file again"
+        in guide.status
+    )
     told = [math.degrees(guide.angle(_frame(1), i)) for i in range(20)]
     factor, offset = angles.get("deg_per_unit", 1), angles.get("offset_deg", 0)
     assert np.allclose(told, factor * np.asarray(data, float) + offset, atol=1e-4)

@@ -260,7 +260,7 @@ def test_a_scan_keeps_its_own_exposure_and_says_so_once() -> None:
         ({"HDF1_FileTemplate": "%s%999999d"}, "does not give a file name; expected %s%s.h5"),
         (
             {"HDF1_FileName": "taken"},
-            r"taken\.h5 cannot be made: it already exists, and this program does not overwrite files",
+            r"taken\.h5 cannot be made: the file already exists, and this program does not overwrite files",
         ),
     ],
 )

@@ -198,7 +198,7 @@ def test_lost_frames_are_named_with_whose_loss_it_was(tmp_path: Path) -> None:
     text = str(told.error)
     assert "4 of 20 projections are missing: 4-5, 10, 14 (from 36° to 126°)." in text
     assert "Frames 5-6 were lost by the plugin T:Pva1:, whose queue was full (DroppedArrays rose by 2)." in text
-    assert "Frame 11 was lost after the plugin had sent them: in the network" in text
+    assert "Frame 11 was lost between the plugin and this program: in the network" in text
     assert "Frame 15 was lost by the camera or its driver, before the plugin T:Pva1:." in text
     (file,) = stored(tmp_path)
     assert file.missing == [4, 5, 10, 14] and np.allclose(file.degrees, 9.0 * (file.ids - 1))

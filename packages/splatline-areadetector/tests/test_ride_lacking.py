@@ -115,8 +115,9 @@ def test_a_pandaboxs_file_with_fewer_rows_than_views(tmp_path: Path) -> None:
     angles = _panda(tmp_path, 9.0 * np.arange(12))
     with FakeIoc() as ioc:
         told = ride_along(config_of(tmp_path, ioc.url, angles), tmp_path, lambda stop: ioc.send(range(1, 21)))
-    assert "panda.h5 has 12 rows, 0° to 99°: the angles of this scan, unless the file is rewritten." in " ".join(
-        told.before
+    assert (
+        "panda.h5 has 12 rows, 0° to 99°. These are the angles of this scan, unless the PandABox writes the file again."
+        in " ".join(told.before)
     )
     assert isinstance(told.error, LedgerError) and "8 of 20 projections are missing: 12-19" in str(told.error)
     assert "8 frames arrived (13-20) but could not be used: the angle is not known" in str(told.error)

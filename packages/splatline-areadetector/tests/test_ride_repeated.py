@@ -25,10 +25,11 @@ WAITING = "Waiting for the first frame"
 @pytest.mark.parametrize(
     ("scans", "in_the_midst", "code", "sentence"),
     [
-        ([range(1, 21), range(21, 41)], False, 0, "Recorded: 2 scans; in 0 of them frames are missing."),
+        ([range(1, 21), range(21, 41)], False, 0, "Recorded: 2 scans; in 0 of these scans, frames are missing."),
         ([range(1, 21), [*range(21, 31), *range(32, 41)], range(41, 61)], False, 5,
-         "Recorded: 3 scans; in 1 of them frames are missing. The last of these: 1 of 20 projections is missing: 10"),
-        ([range(1, 21)], True, 4, "Recorded: 1 scan before this one; in 0 of them frames are missing."),
+         "Recorded: 3 scans; in 1 of these scans, frames are missing. The last of these: 1 of 20 projections is "
+         "missing: 10"),
+        ([range(1, 21)], True, 4, "Recorded: 1 scan before this one; in 0 of these scans, frames are missing."),
     ],
 )  # fmt: skip
 def test_scan_after_scan_until_ctrl_c(

@@ -69,8 +69,9 @@ class Cluster:
             result: Reconstruction = future.result()
         except (KilledWorker, CancelledError) as error:
             raise WorkersLostError(
-                f"The scheduler was lost, or several workers with the same slab ({error}). They may have too little "
-                "memory: give a smaller --memory, or fewer workers. Finished slabs are kept: continue with --resume."
+                f"Either the scheduler was lost, or several workers that computed the same slab were lost ({error}). "
+                f"The workers may have too little memory: give a smaller --memory, or fewer workers. Finished slabs "
+                f"are kept: continue with --resume."
             ) from error
         return result
 

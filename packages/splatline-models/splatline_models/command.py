@@ -75,7 +75,8 @@ def _making(volume: Path, output: Path, as_json: bool) -> Iterator[tuple[Model, 
     "--box",
     metavar="Z0:Z1,Y0:Y1,X0:X1",
     callback=parsed(box_of),
-    help="Box to fill, in the unit of VOLUME, with x and y from the rotation axis. Default: that of VOLUME.",
+    help="Region in which voxels are computed, in the unit of VOLUME; x and y count from the rotation axis. Default: "
+    "the region of VOLUME.",
 )
 @json_option
 def voxelise(volume: Path, output: Path, voxel: float | None, box: Box | None, as_json: bool) -> None:

@@ -149,7 +149,10 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
     grid = Grid.for_fit(geometry, problem.grid, wider=problem.wide)
     unit = density_unit(first_volume(data[used], geometry.select(used), grid).data)
     if unit <= 0 or not (data[used] > 0).any():
-        raise ValueError("the projections show no absorbing sample, but a field needs projections of a sample")
+        raise ValueError(
+            "the projections show no absorbing sample, but a neural field can be trained only on "
+            "projections of a sample"
+        )
     edge = float(np.ptp(grid.edges, axis=0).max())
     if weights is not None:
         weights = weights / np.float32(weights[weights > 0].mean(dtype=np.float64))

@@ -71,8 +71,8 @@ _FILE = click.Path(path_type=Path)
 @click.option(
     "--scan",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="Scan of the volume, which is reconstructed again from each half of its projections. Default: the scan that "
-    "the volume names.",
+    help="Scan from which the volume was made. The command reconstructs it again from each half of the projections. "
+    "Default: the scan that the volume names.",
 )
 @click.option(
     "--quick",
@@ -108,7 +108,8 @@ _FILE = click.Path(path_type=Path)
     type=click.IntRange(0, 20),
     default=1,
     show_default=True,
-    help="Radius, in voxels, of the ball that opens and closes particles; 0: neither.",
+    help="Radius, in voxels, of the ball for the morphological opening and closing of particles; 0: no opening and "
+    "closing.",
 )
 @click.option(
     "--smallest",

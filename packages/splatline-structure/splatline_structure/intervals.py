@@ -43,8 +43,8 @@ UNDECIDED, SURE = 0.15, 0.8
 WIDEST, NARROWEST = 0.5, 0.001
 CAUSES = {
     "views": "more projections would narrow the interval",
-    "levels": "the threshold limits this; more projections would not help",
-    "voxels": "the voxel size limits this; more projections would not help",
+    "levels": "the threshold sets the width of the interval; more projections would not help",
+    "voxels": "the voxel size sets the width of the interval; more projections would not help",
     "particles": "more whole particles (a larger field of view) would narrow the interval",
 }
 _NO_CAUSE = (
@@ -215,7 +215,9 @@ def _interval(
         )
     if not all(map(math.isfinite, (*halves, *sides, wide))):
         return Interval(
-            value, why_not="its existence depends on the threshold, on the number of projections or on the voxel size"
+            value,
+            why_not="whether this number exists depends on the threshold, on the number of projections or on "
+            "the voxel size",
         )
     still, of_voxels = OF_KIND.get(kind, OTHERS) if cubes else (OF_KIND.get(kind, OTHERS)[0], OTHERS[1])
     change = value - float(np.mean(halves)) if halves else math.nan

@@ -116,8 +116,8 @@ def measure_states(paths: Sequence[Path], output: Path, answer: Answer, values: 
         states.append(MeasuredState(path, x, n_views, numbers_of(reference, fit), fit.matches))
         if not fit.matches:
             answer.warn(
-                f"{path} shows another sample than {first}, or one of which most has changed: less than half of the "
-                "particles of the reference are in it. Its numbers are not determined."
+                f"{path} shows another sample than {first}, or a sample that has mostly changed: less than half of the "
+                "particles of the reference are in it. The numbers of this state are not determined."
             )
     if not any(state.matches for state in states):
         raise DataError(
@@ -166,7 +166,7 @@ def _particles(path: Path, data: F32, record: Any, values: dict[str, Any]) -> tu
         )
     try:
         if label_values(data).size:
-            raise ValueError("it contains labels, and grey values are expected")
+            raise ValueError("the file contains labels, and grey values are expected")
         thresholds = materials_of(np.ascontiguousarray(data[box_in(data, "square")]), n_materials).thresholds
         mask = labelled(data, thresholds) == particles - 1
         labels = parted(cleaned(mask, values["radius"], values["smallest"]), values["neck"])
@@ -187,7 +187,8 @@ def _first_time(path: Path, record: Any, values: dict[str, Any]) -> float:
         needed = BYTES_A_VOXEL * math.prod(record.grid.shape) + BYTES_A_RAY * rays
         if needed > values["memory"]:
             raise DataError(
-                f"{path}: not enough memory. It needs {size(rounded(needed, up=True))}, and {size(values['memory'])} "
+                f"{path}: not enough memory. This file needs {size(rounded(needed, up=True))}, and "
+                f"{size(values['memory'])} "
                 "are allowed. Free memory, or give more --memory. Nothing was written."
             )
         pixel = source.pixel_size_mm

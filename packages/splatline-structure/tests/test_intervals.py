@@ -50,7 +50,7 @@ def test_words_name_no_cause_where_none_moves_a_number() -> None:
     )
     assert (
         Interval(1, 0.99, 1, 0, views=0, levels=0.01, voxels=0).words
-        == "the threshold limits this; more projections would not help"
+        == "the threshold sets the width of the interval; more projections would not help"
     )
 
 

@@ -55,8 +55,8 @@ def test_a_volume_gets_a_folder_of_numbers_particles_labels_and_a_page(here: Pat
     assert float(size["low"]) < float(size["value"]) < float(size["high"]) and size["unit"] == "µm"
     assert size["decides"] == "more whole particles (a larger field of view) would narrow the interval"  # of six balls
     assert rows["fraction_2"]["decides"] in (
-        "the threshold limits this; more projections would not help",
-        "the voxel size limits this; more projections would not help",
+        "the threshold sets the width of the interval; more projections would not help",
+        "the voxel size sets the width of the interval; more projections would not help",
     )
     assert facts["numbers"]["fraction_2"]["value"] == pytest.approx(float(rows["fraction_2"]["value"]), rel=1e-3)
     particles = _rows(here / "can_structure/particles.csv")

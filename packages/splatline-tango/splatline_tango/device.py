@@ -127,7 +127,10 @@ def _sender(run: FollowedRun, verb: Verb) -> Callable[[Any], None]:
         _send(run, lambda: verb, send.__name__)
 
     send.__name__ = verb.value.capitalize()
-    send.__doc__ = f"Same as `beamline {verb}`. Returns at once; the state says when it is done."
+    send.__doc__ = (
+        f"Same as `beamline {verb}`. This command returns at once; the state of the device shows when the "
+        f"scan has carried it out."
+    )
     return send
 
 

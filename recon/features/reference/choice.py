@@ -130,7 +130,7 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     if best is None or alone is None:
         return ReferenceVerdict(False, "stopped before it was tried")
     least = choice.least
-    others = [("total variation of the same kind without it", trial.in_line_integrals(alone.residuals))]
+    others = [("the same total variation without the reference", trial.in_line_integrals(alone.residuals))]
     others += [] if least is None or choice.best is None else [(choice.predictions[choice.best].name, least)]
     own = trial.in_line_integrals(best.residuals)
     told = f"root mean square residual in held-out projections, with the reference {own.mean():#.4g}"

@@ -103,7 +103,7 @@ def require_finite(reference: Volume) -> None:
     if wrong:
         raise ValueError(
             f"{wrong} of {voxels.size} voxels of the reference are not finite, but each must be an attenuation in "
-            "1/mm; write 0 where there is no material, and interpolate where there is some"
+            "1/mm; write 0 in places without material, and interpolate in places with material"
         )
 
 
@@ -124,7 +124,7 @@ def placed(reference: Volume, grid: Grid, margin: int) -> tuple[F32, tuple[int, 
     high = np.minimum(np.floor(ends + 0.01), size - 1 + margin).astype(int)
     if (high < low).any():
         raise ValueError(
-            f"the reference, {given}, and the volume to reconstruct, {grid}, have no common place; give a volume of "
+            f"the reference, {given}, and the volume to reconstruct, {grid}, do not overlap; give a volume of "
             "the same sample in the same frame"
         )
     ratio, offset = edge / own, (start + low * edge - own_start) / own

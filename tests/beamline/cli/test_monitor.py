@@ -33,7 +33,7 @@ def test_flags_are_listed_with_frames_score_limit_and_advice(here: Path) -> None
     assert lines[1].strip() == "worst score 2 (limit 0 repetitions), in frame 9"
     assert "restart the camera" in lines[2]
     assert lines[-1] == "scan.h5: 34 frames, flagged: stuck 2 alarm"
-    assert "2 of 34 frames have an alarm. They are listed on stdout" in result.stderr.splitlines()[-1]
+    assert "2 of 34 frames have an alarm. The list of these frames is on stdout" in result.stderr.splitlines()[-1]
     assert "34/34" in result.stderr
     assert (here / "scan.h5").read_bytes() == before
 
@@ -54,9 +54,9 @@ def test_bad_references_are_told_and_limits_may_be_given(here: Path) -> None:
     write_exchange(here / "lit.h5", SCAN, {"data_dark": np.full((2, *SCAN.shape), 15000, np.uint16)})
     result = beamline("monitor", "lit.h5")
     assert result.exit_code == 7
-    assert "The darks 0-1: they were exposed to the beam." in result.stdout.splitlines()[3]
+    assert "The darks 0-1: these darks were exposed to the beam." in result.stdout.splitlines()[3]
     limits = "--config", str(config_folder() / "demo.yaml"), "--set", "references.light_in_darks=0.9"
-    assert "they were exposed" not in beamline("monitor", "lit.h5", *limits).stdout
+    assert "these darks were exposed" not in beamline("monitor", "lit.h5", *limits).stdout
     assert beamline("monitor", "lit.h5", "--set", "references.light_in_darks=0.9").exit_code == 2
 
 

@@ -97,8 +97,8 @@ def slit(images: Images) -> Images:
 @pytest.mark.parametrize(
     ("spoil", "what", "said"),
     [
-        (saturated, "saturated", "of their pixels are saturated (limit 0.10%)"),
-        (dimmed, "no_beam", "they show no beam"),
+        (saturated, "saturated", "of the pixels are saturated (limit 0.10%)"),
+        (dimmed, "no_beam", "these flats show no beam"),
         (flickering, "uneven", "differs by 22% from flat to flat (limit 10%)"),
         (crossed, "uneven", "something was in the beam"),
         (slit, "mostly_unlit", "62% of the frame gets no beam"),
@@ -117,7 +117,7 @@ def test_each_fault_of_flats_is_named_with_its_figure(spoil: Callable[[Images], 
 def test_darks_with_light_are_told_from_darks_with_an_offset(share: float) -> None:
     """Light brings its noise: 25 photons on an offset of 100 counts are no lit darks, a leaking shutter is."""
     (fault,) = found(darks(share * PHOTONS), flats(frames(5, PHOTONS, 2)))
-    assert fault.rule == "light_in_darks" and "they were exposed to the beam" in fault.message
+    assert fault.rule == "light_in_darks" and "these darks were exposed to the beam" in fault.message
     assert rules(darks(), flats(frames(5, 25.0, 2))) == []
 
 

@@ -210,7 +210,7 @@ VIOLATIONS = {
     "exposure over period": ({"exposure": 0.2}, "scan.exposure_s 0.2 is longer than scan.period_s 0.1"),
     "speed": (
         {"angles": angles.fixed(40, 90 * DEG)},
-        "needs 45°/s, the stage turns at most 30°/s; set scan.period_s >= 0.15",
+        "needs 45°/s, but the stage turns at most 30°/s; set scan.period_s >= 0.15",
     ),
     "start": ({"angles": angles.fixed(360, -5 * DEG)}, "go from -5.5° to 175° (with 0.5° of run-up at each end)"),
     "end": ({"angles": angles.fixed(360, 186 * DEG)}, "limits are -5° ... 365°"),
@@ -332,11 +332,11 @@ REMARKS = {
     "no darks": ({"darks": FieldPlan(5, Place.NONE, 0.05)}, "no darks will be taken"),
     "exposure": (
         {"flats": FieldPlan(5, Place.END, 0.1)},
-        "flats are exposed for 0.1 s and projections for 0.05 s; their intensity",
+        "flats are exposed for 0.1 s and projections for 0.05 s; the intensity of the flats",
     ),
     "darks' exposure": (
         {"darks": FieldPlan(5, Place.END, 0.1)},
-        "darks are exposed for 0.1 s and projections for 0.05 s; th",
+        "darks are exposed for 0.1 s and projections for 0.05 s; hot pixels",
     ),
     "blur": ({"exposure": 0.09, "angles": angles.fixed(360, 0, 2 * math.pi)}, "motion blur is 1.98 px"),
 }

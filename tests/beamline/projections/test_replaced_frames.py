@@ -62,7 +62,7 @@ def test_one_lit_dark_does_not_change_a_volume(n: int) -> None:
         blocks.of(DARK)[0][0] += share * BEAM
         found, (line,) = decibels(blocks.source())
         assert found > clean(1, n) - 0.1
-        assert line.startswith("The darks 0: they were exposed to the beam")
+        assert line.startswith("The darks 0: these darks were exposed to the beam")
 
 
 @pytest.mark.parametrize(("scale", "at"), others_slow([(1.0, 1), (0.05, 0), (3.0, 2)]))

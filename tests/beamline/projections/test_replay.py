@@ -199,5 +199,5 @@ def test_a_check_that_fails_is_off_and_named_and_the_others_go_on() -> None:
     assert beside.kinds == alone.kinds and alone.alarmed == (20,)
     assert [text for text in beside.aside if text not in alone.aside] == [
         "the check fails failed at frame 6 and is switched off; the other checks continue: "
-        "TypeError('it returned None; expected a CheckResult with a Flag or None')"
+        "TypeError('the check returned None; expected a CheckResult with a Flag or None')"
     ]

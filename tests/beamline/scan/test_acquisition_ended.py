@@ -140,7 +140,12 @@ def test_a_camera_error_once_is_survived_twice_is_not() -> None:
     [
         (Faults(ignored=set(range(5, 99))), InstrumentError, "trigger cable", 5),
         (Faults(stall_at=8700), DeviceError, "stopped short", 5 + 6),
-        (Faults(stuck_shutter=True), InstrumentError, "shutter: it is closed, but flats need it open", 3),
+        (
+            Faults(stuck_shutter=True),
+            InstrumentError,
+            "shutter: the device is closed, but for flats it must be open",
+            3,
+        ),
     ],
 )
 def test_a_device_that_does_not_do_its_part_ends_the_scan_in_its_own_words(

@@ -143,7 +143,7 @@ def test_a_view_during_which_it_is_moved_is_taken_again(stage: str, disturb: str
     assert angles[key == 0] == pytest.approx(np.arange(VIEWS) * 20.0, abs=0.011)
     (said,) = [event.data["message"] for event in events if event.event == "warning"]
     assert said.startswith(
-        f"Projection {MOVED}: its frame was exposed while the stage was not at the planned angle of 80.0000°"
+        f"Projection {MOVED}: the frame was exposed while the stage was not at the planned angle of 80.0000°"
     )
     assert [found.rule for found in validate(path) if found.severity == "error"] == []
     assert events[-1].event == "done" and [e for e in events if e.event == "frame"][-1].data["n"] == result.n_frames
@@ -153,9 +153,10 @@ def test_a_view_during_which_it_is_moved_is_taken_again(stage: str, disturb: str
 def test_one_that_is_moved_each_time_is_missing_and_named(kind: str, disturb: Disturb, tmp_path: Path) -> None:
     _, error, _, path = scanned(KINDS[kind], disturb, tmp_path, 3)
     assert isinstance(error, LedgerError) and error.missing == (FIRST + MOVED,)
-    assert "1 of 9 projections is missing: 4 (from 80° to 80°). In 1 of them the stage was not at its angle" in str(
-        error
+    missing = (
+        "1 of 9 projections is missing: 4 (from 80° to 80°). In 1 of the missing projections, the stage was not at"
     )
+    assert missing in str(error)
     with h5py.File(path) as file:
         key = file["entry/instrument/detector/image_key"][()]
         assert list(file["entry/progress/missing_triggers"]) == [FIRST + MOVED]
@@ -205,7 +206,9 @@ def test_a_device_in_the_beam_that_is_moved_ends_the_scan(kind: str, device: str
         used = nudged(instrument, touched, frame, 1, motor_of(getattr(instrument.devices, name)))
         block, first = ("flats", 2) if frame == 2 else ("projections", 4)
         rows = f"frames {first}-{3 if frame == 2 else 12} of the file"
-        with pytest.raises(InstrumentError, match=rf"{device}:.*is now at.*It was moved while.*{block} \({rows}\)"):
+        with pytest.raises(
+            InstrumentError, match=rf"{device}:.*is now at.*The device was moved while.*{block} \({rows}\)"
+        ):
             run_scan(settings, tmp_path, instrument=used)
     (run,) = tmp_path.iterdir()
     with h5py.File(run / "scan.h5") as file:
@@ -244,5 +247,5 @@ def test_a_shutter_that_moves_by_itself_ends_the_scan(at: int, kind: str, tmp_pa
             shutter.open() if kind == "darks" else shutter.close()
 
         used = nudged(instrument, by_itself, at, 1)
-        with pytest.raises(InstrumentError, match=rf"{kind} need"):
+        with pytest.raises(InstrumentError, match=rf"but for {kind} it must be"):
             run_scan(settings, tmp_path, instrument=used)

@@ -25,8 +25,8 @@ from tests.beamline.ran import Ran
 @pytest.mark.parametrize(
     ("light", "dark", "faults", "said"),
     [
-        (210, 200, Faults(), "The flats 3-4: they show no beam"),
-        (20000, 15000, Faults(), "The darks 0-2: they were exposed to the beam"),
+        (210, 200, Faults(), "The flats 3-4: these flats show no beam"),
+        (20000, 15000, Faults(), "The darks 0-2: these darks were exposed to the beam"),
         (20000, 200, Faults(lost={3, 4}), "The 2 flats planned before the projections were not taken"),
     ],
 )
@@ -56,14 +56,14 @@ def test_the_operator_may_want_the_scan_all_the_same(
     monkeypatch.setitem(fakes.LEVEL, False, 15000)
     ran = Ran(tmp_path, FakeInstrument(), wanted)
     assert ran.result.n_frames == 19
-    assert ["they were exposed" in text for text in ran.warnings] == [True] * told
+    assert ["these darks were exposed" in text for text in ran.warnings] == [True] * told
 
 
 def test_bad_flats_at_the_end_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     last_view = 16  # after three darks and two flats
     ran = Ran(tmp_path, FakeInstrument(at={last_view: lambda: monkeypatch.setitem(fakes.LEVEL, True, 210)}))
     assert ran.result.reference_faults == tuple(ran.warnings)
-    assert [text[:46] for text in ran.warnings] == ["The flats 17-18: they show no beam. Was the sh"]
+    assert [text[:46] for text in ran.warnings] == ["The flats 17-18: these flats show no beam. Was"]
 
 
 def test_flats_without_the_light_of_the_views_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

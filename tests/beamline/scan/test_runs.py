@@ -171,7 +171,7 @@ def test_of_a_kill_before_the_first_frame_nothing_that_refuses_is_advised(tmp_pa
             (run / "scan.h5").write_bytes(content)
         died = describe(run)
         assert (died.state, died.frames) == ("died", 0)
-        assert died.next_step == "It ended before its first frame: start the scan again."
+        assert died.next_step == "The run ended before its first frame: start the scan again."
     with pytest.raises(DataError, match=r"has no frame: .*Nothing was changed"):
         recover_run(run)
     (run / "config.resolved.yaml").write_text(resolved_yaml(small()))

@@ -82,7 +82,7 @@ def test_a_scan_that_died_can_be_resumed_or_recovered_and_its_file_alone_be_reco
         "The process of its scan was killed, unless a program is still writing to it: "
     )  # perhaps no locks
     for lock in (WriterLock(scan), WriterLock(died / "config.resolved.yaml", exclusive=True)):
-        assert next_step(scan).startswith(f"Its scan is still running: `beamline watch {died}`")
+        assert next_step(scan).startswith(f"The scan is still running: `beamline watch {died}`")
         assert "recover" not in next_step(scan)
         lock.release()
 
@@ -91,7 +91,7 @@ def test_a_scan_that_died_can_be_resumed_or_recovered_and_its_file_alone_be_reco
 @pytest.mark.parametrize("end", ["stopped", "aborted"])
 def test_a_scan_that_ended_early_can_be_resumed_until_nothing_is_missing(tmp_path: Path, end: str) -> None:
     run = ended_run(tmp_path, end, at=AT)
-    said = f"It ended early: `beamline scan --resume {run}` takes the missing projections."
+    said = f"The run ended early: `beamline scan --resume {run}` takes the missing projections."
     assert next_step(run / "scan.h5") == said
     assert said in beamline("validate", run).output
     assert said in beamline("recon", run, "-m", "fbp", "-o", tmp_path / "part.h5", "--no-report").output
@@ -108,7 +108,7 @@ def test_nobody_is_told_to_continue_a_ride(tmp_path: Path) -> None:
             config.write("\nride: {image: pva://X:Pva1:Image}\n")
     died, stopped = (next_step(next((tmp_path / end).rglob("scan.h5"))) for end in ("killed", "stopped"))
     assert died.startswith("The process of its scan was killed: `beamline recover ") and "--resume" not in died
-    assert stopped == "It ended early. It recorded the scan of another program, so it cannot be continued."
+    assert stopped == "The run ended early. It recorded the scan of another program, so it cannot be continued."
 
 
 def test_parts_that_are_not_joined_are_not_taken_for_the_scan(tmp_path: Path) -> None:

@@ -41,7 +41,8 @@ def test_a_writer_that_gives_up_its_lock_is_gone_at_once_unless_it_finished(tmp_
     assert not any(watch.lost(now, False, lambda: False) for now in (5.0, 50.0, 500.0))  # it waits, and has the lock
     lock.release()
     assert not watch.lost(502.0, False, lambda: True)
-    assert watch.lost(502.5, False, lambda: False) == "is no longer being written, because its program ended"
+    ended = "is no longer being written, because the program that wrote it has ended"
+    assert watch.lost(502.5, False, lambda: False) == ended
 
 
 def test_a_writer_without_a_lock_is_gone_when_no_frame_comes(tmp_path: Path) -> None:

@@ -309,12 +309,12 @@ OF_MOTION = (
     FaultElsewhere(
         'step scan: the stage moved after it had arrived (another program, the panel, a hunting servo, a "done" that '
         "comes too early)",
-        "its frame was exposed while the stage was not at the planned angle",
+        "the frame was exposed while the stage was not at the planned angle",
         ("beamline/scan/test_moved_while_exposed.py", "test_a_view_during_which_it_is_moved_is_taken_again"),
     ),
     FaultElsewhere(
         "filter, sample mover, monochromator or shutter moved during a block",
-        "It was moved while",
+        "The device was moved while",
         ("beamline/scan/test_moved_while_exposed.py", "test_a_device_in_the_beam_that_is_moved_ends_the_scan"),
     ),
 )

@@ -140,7 +140,7 @@ def test_ring_overrun(rig_of: RigOf, tmp_path: Path) -> None:
     rig.at_frame[table.FIRST_VIEW + 4] = lambda: rig.clock.sleep(0.45)
     scanned = rig.scan(tmp_path)
     (warning,) = scanned.warnings
-    assert re.search(r"its ring of 2 frames was overrun and \d frames are lost", warning)
+    assert re.search(r"the ring buffer of 2 frames was overrun and \d frames are lost", warning)
     lost = assert_lost(rig, scanned, tmp_path, "ring overrun")
     assert lost == list(range(5, 5 + len(lost))) and 2 <= len(lost) <= 4
 

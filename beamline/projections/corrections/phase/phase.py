@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _AUTO = "auto"
 _NO_FILTER = (
     "To apply a phase filter, give --phase paganin:RATIO (delta/beta). --phase auto found no filter: either no "
-    "filter predicts held-out projections better than no filter does, or the scan has fewer than 16 projections."
+    "filter improves the prediction of held-out projections, or the scan has fewer than 16 projections."
 )
 
 
@@ -68,9 +68,9 @@ class Phase:
         "--phase",
         _AUTO,
         "Phase retrieval from one distance (Paganin). X is the ratio delta/beta, or a material: a "
-        "chemical formula, or a material of the simulator. none: no filter. auto: a filter only if the outer edges "
-        "of the sample show phase fringes; its length, which follows from delta/beta and the distance, is the one "
-        "that predicts held-out projections best.",
+        "chemical formula, or a material of the simulator. none: no filter. auto: a filter is applied only if the "
+        "outer edges of the sample show phase fringes. Held-out projections choose the length of the filter, which "
+        "otherwise follows from delta/beta and the distance.",
         parse=_material,
         metavar="auto|none|paganin:X",
     )

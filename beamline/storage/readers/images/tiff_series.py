@@ -170,9 +170,9 @@ class TiffSeriesSource(ScanSource):
     def _opened(self, name: str, most: int) -> IO[bytes]:
         """The content of a file of the series, which may have at most `most` bytes."""
         if (n := self._size(name)) > most:
-            raise OSError(errno.EFBIG, f"it has {size(n)}; at most {size(most)} are allowed")
+            raise OSError(errno.EFBIG, f"the image has {size(n)}; at most {size(most)} are allowed")
         if self._zip is not None and is_blank(n, self._zip.getinfo(name).compress_size, n):
-            raise OSError(errno.EFBIG, f"it unpacks to {size(n)} of nearly equal values, which is not an image")
+            raise OSError(errno.EFBIG, f"the file unpacks to {size(n)} of nearly equal values, which is not an image")
         return (self.path / name).open("rb") if self._zip is None else self._zip.open(name)
 
     @contextmanager

@@ -166,8 +166,8 @@ def test_a_stop_leaves_the_scans_that_are_done_and_nothing_half(folder: Path, mo
     ("program", "reason"),
     [
         ("import os, sys; print('out of memory', file=sys.stderr, flush=True); os.abort()", "out of memory"),
-        ("import time; time.sleep(600)", "its process was ended, because it printed nothing for 1.5 s"),
-        ("", "its process ended with code 0"),
+        ("import time; time.sleep(600)", "the process of this scan was ended, because it printed nothing for 1.5 s"),
+        ("", "the process of this scan ended with code 0"),
     ],
 )
 def test_a_scan_whose_process_crashes_or_hangs_or_leaves_no_volume_fails_with_the_reason(

@@ -52,8 +52,8 @@ def turn(degrees: float, views: int, endpoint: bool = False) -> NDArray[np.float
 @pytest.mark.parametrize(
     ("true", "stated", "unit"),
     [
-        (turn(180, 240), np.arange(240.0), "they are 0, 1, 2 and so on, so they are frame numbers"),
-        (turn(180, 90), np.arange(90.0), "they are 0, 1, 2 and so on, so they are frame numbers"),
+        (turn(180, 240), np.arange(240.0), "the values are 0, 1, 2 and so on, so they are frame numbers"),
+        (turn(180, 90), np.arange(90.0), "the values are 0, 1, 2 and so on, so they are frame numbers"),
         (turn(180, 120), turn(360, 120), "times as large as stated"),
     ],
 )

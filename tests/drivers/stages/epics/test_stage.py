@@ -35,8 +35,8 @@ def _stage(url: str, clock: TickingClock, **settings: Any) -> EpicsStage:
     ("build", "said"),
     [
         ({"unit": "mm"}, r"its unit \(EGU\) is 'mm', expected 'deg'"),
-        ({"counts_per_turn": 36_000}, r"its step \(MRES\) is 0.01 deg, expected 0.001"),
-        ({"fastest": 20.0}, r"its maximum speed \(VMAX\) is 20, below 30 deg/s"),
+        ({"counts_per_turn": 36_000}, r"the step of the motor record \(MRES\) is 0.01 deg, expected 0.001"),
+        ({"fastest": 20.0}, r"the maximum speed of the motor record \(VMAX\) is 20, below 30 deg/s"),
         ({"low": -5.0, "high": 99.0}, r"limited to -5.0000 deg to 99.0000 deg.*widen LLM and HLM"),
     ],
 )

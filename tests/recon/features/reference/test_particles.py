@@ -60,5 +60,5 @@ def test_coarser_voxels_have_the_means_of_the_reference() -> None:
 
 def test_a_reference_elsewhere_is_refused() -> None:
     reference = Volume(np.ones((4, 4, 4), np.float32), Grid((4, 4, 4), 1.0))
-    with pytest.raises(ValueError, match="have no common place; give a volume of the same sample"):
+    with pytest.raises(ValueError, match="do not overlap; give a volume of the same sample"):
         placed(reference, Grid((4, 4, 4), 1.0, centre=(100.0, 0.0, 0.0)), 2)
