@@ -9,6 +9,7 @@ import os
 import platform
 import shutil
 import stat
+import tempfile
 import time
 import uuid
 import zlib
@@ -248,6 +249,24 @@ def refuse_not_utf8(path: Path | str) -> None:
             f"The path {path} contains bytes that are not UTF-8, so no result could state its name. Rename the file or "
             "folder. Nothing was read."
         ) from error
+
+
+def same_file(first: Path, second: Path) -> bool:
+    """Whether two paths name one file, even one that is still to be written.
+
+    Two names that differ only in upper and lower case are one file on the disks of Windows and macOS, and on many USB
+    disks. A short-lived file in the folder of `first` tells whether its disk is of that kind.
+    """
+    names = os.path.realpath(first), os.path.realpath(second)
+    if names[0] == names[1] or names[0].casefold() != names[1].casefold():
+        return names[0] == names[1]
+    with suppress(OSError):
+        if first.exists() or second.exists():
+            return first.exists() and first.samefile(second)
+        with tempfile.NamedTemporaryFile(prefix="aB", dir=first.parent) as file:
+            probe = Path(file.name)
+            return probe.with_name(probe.name.swapcase()).exists()
+    return False
 
 
 def replaceable(path: Path) -> Path:
