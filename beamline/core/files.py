@@ -9,7 +9,6 @@ import os
 import platform
 import shutil
 import stat
-import tempfile
 import time
 import uuid
 import zlib
@@ -263,9 +262,12 @@ def same_file(first: Path, second: Path) -> bool:
     with suppress(OSError):
         if first.exists() or second.exists():
             return first.exists() and first.samefile(second)
-        with tempfile.NamedTemporaryFile(prefix="aB", dir=first.parent) as file:
-            probe = Path(file.name)
+        probe = first.with_name(f"aB-{uuid.uuid4().hex[:8]}")
+        probe.touch(exist_ok=False)
+        try:
             return probe.with_name(probe.name.swapcase()).exists()
+        finally:
+            probe.unlink()
     return False
 
 
