@@ -21,9 +21,9 @@ class Model:
     """Gaussians and the projections to which they were fitted.
 
     Attributes:
-        gaussians: lengths in `length_unit`.
+        gaussians: the Gaussians, with lengths in `length_unit`.
         geometry: geometry of these projections, in the same unit.
-        record: record of the volume made from the Gaussians; its voxels are not read.
+        record: record of the volume that was made from the Gaussians; its voxels are not read.
     """
 
     gaussians: Gaussians
@@ -35,7 +35,7 @@ def read_model(path: Path) -> Model:
     """The model in a reconstruction file.
 
     Raises:
-        DataError: the file contains no Gaussians, or cannot be read.
+        DataError: the file contains no Gaussians, or it cannot be read.
     """
     with opened_reconstruction(path) as record, hdf5.readable(path):
         arrays = record.model
@@ -56,5 +56,5 @@ def read_model(path: Path) -> Model:
             arrays["centres"], arrays["widths"], arrays["densities"], arrays["rotations"],
             float(arrays["density_unit"]), Kernel(str(arrays["kernel"])),
         )  # fmt: skip
-        # Error bars are of the file's voxels, and the file is closed behind this.
+        # The error bars belong to the voxels in the file, which is closed at the end of this function.
         return Model(gaussians, geometry, replace(record, deviation=None))

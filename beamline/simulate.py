@@ -1,4 +1,6 @@
-"""Files next to simulated scans: labels of anomalies as JSON, to test monitors, and volumes that scenes name."""
+"""Writes the labels of anomalies in a simulated scan as JSON, to test monitors. Also reads the volumes that a scene
+names.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +24,9 @@ if TYPE_CHECKING:
 class LabelledRun:
     """One anomaly in consecutive frames."""
 
-    kind: str  # the anomaly's name
-    first: int  # its first frame, counted in the file from 0
-    # regions: one for each frame: (first row, row after the last, first column, column after the last)
+    kind: str  # name of the anomaly
+    first: int  # number of the first frame with the anomaly, counted in the file from 0
+    # one region for each frame: (first row, row after the last, first column, column after the last)
     regions: tuple[PixelBox, ...]
 
     @property
@@ -42,7 +44,7 @@ class LabelLog:
         self._frames.extend((frame, label) for label in labels)
 
     def runs(self, n_frames: float = math.inf) -> tuple[LabelledRun, ...]:
-        """Runs in the order of their first frames, of the first `n_frames` only."""
+        """The labels in the order of their first frames. Only the first `n_frames` frames count."""
         open_runs: dict[tuple[str, int], LabelledRun] = {}
         done: list[LabelledRun] = []
         for frame, label in (entry for entry in self._frames if entry[0] < n_frames):
@@ -62,7 +64,7 @@ def labels_path(scan: Path) -> Path:
 
 
 def write_labels(path: Path, runs: Sequence[LabelledRun], n_frames: int) -> None:
-    """Write the labels; a scan without anomalies gets an empty list. The file is complete or absent.
+    """Write the labels. A scan without anomalies gets an empty list. The file is written completely or not at all.
 
     Raises:
         DataError: `path` exists or cannot be written.
@@ -79,7 +81,9 @@ def write_labels(path: Path, runs: Sequence[LabelledRun], n_frames: int) -> None
 
 
 def volumes_beside(folder: Path) -> ReadVolume:
-    """A reader of the volumes that a scene in `folder` names, by full or relative paths. It raises DataError."""
+    """A function that reads the volumes that a scene names, by paths that are absolute or relative to `folder`. It
+    raises DataError.
+    """
     from simulators.samples.sample import Stored
 
-    return lambda file, dataset: Stored(*whole_volume(folder / file, dataset))  # a full path stays itself
+    return lambda file, dataset: Stored(*whole_volume(folder / file, dataset))  # an absolute path is not changed

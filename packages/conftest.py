@@ -1,4 +1,4 @@
-"""Fixtures of the tests of splatline, for those of its add-ons."""
+"""Makes the fixtures of splatline's tests available to the tests of its add-ons."""
 
 from tests.beamline.cli.conftest import folder, no_debug
 from tests.beamline.conftest import _undrawn, real_pictures

@@ -30,10 +30,9 @@ _SMALLEST = 64  # detectors with fewer pixels along a side are not binned
 class Auto(Method):
     """Tries methods on a part of the scan, and takes the simplest method that is about as good as the best one.
 
-    The measure of a method is how well its volume predicts the held-out projections.
-
-    The part is the sixteen rows with most material; in a cone beam, the sixteen rows in the middle. If these rows
-    contain little material, the part is all rows at half the resolution. One of eight projections is held out. Test
+    The measure of a method is how well its volume predicts the held-out projections. `Auto` tries the methods on the
+    sixteen rows with most material; in a cone beam, on the sixteen rows in the middle. If these rows contain little
+    material, it tries the methods on all rows at half the resolution. One of eight projections is held out. Test
     reconstructions need at least 16 projections; with fewer, `Auto` uses the last candidate. docs/choosing.md gives the
     reasons.
 
@@ -68,7 +67,7 @@ class Auto(Method):
         return self.run_chosen(choice, problem, replace(control, decide=decide))
 
     def run_chosen(self, choice: TrialChoice, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        """The same as `run`, for a choice that was made before. `control.decide` must be given."""
+        """Reconstruct with the method that `choose` has already chosen. `control.decide` must be given."""
         assert control.decide is not None
         control.decide.prior = choice.prior
         chosen, result = self._run_choice(choice, problem, control)
@@ -98,8 +97,9 @@ class Auto(Method):
         return self.tried(problem, control)[0]
 
     def tried(self, problem: ReconProblem, control: RunControl) -> tuple[TrialChoice, Trial | None]:
-        """The choice, as from `choose`, and the test reconstructions. These are None if there were none, or if they
-        were stopped."""
+        """The choice that `choose` returns, and the test reconstructions that led to it. The second value is None if no
+        test reconstruction was made, or if the run was stopped.
+        """
         data = problem.projections
         if not any(np.isfinite(view).any() and np.nan_to_num(view, posinf=0, neginf=0).any() for view in data):
             raise ValueError("all projections are zero, so there is nothing to reconstruct")

@@ -51,7 +51,7 @@ def axis_by_views(
     180° scan of a sample wider than the field of view in a parallel beam, use `find_axis` instead.
 
     Args:
-        projections: float32 [view, row, col], line integrals; `VIEWS` x `COLS` are enough.
+        projections: float32 [view, row, col], line integrals; `VIEWS` projections of `COLS` columns are enough.
         geometry: geometry of these projections; the search begins at its `axis_col`.
         progress: function that gets the number of candidates tried so far. lit: bool [row, col] or [view, row, col],
             True for pixels with data; None: all pixels have data.

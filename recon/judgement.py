@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Flag, auto
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,8 @@ from recon.voxels.matter_checks import (
     unexplained_memory,
 )
 from recon.voxels.odd_views import OddView, odd_views, odd_views_memory
-from recon.voxels.residuals import SquaresLeft, left_by_volume
+from recon.voxels.one_projection import RayCheck, project_parts
+from recon.voxels.residuals import SquaresLeft, residual, uniform_residual
 
 _VIEWS = 16  # largest number of used projections in the residual; limits the time
 _ODD_VIEWS_WORK = 1.5  # duration of `odd_views`, in units of projecting the volume once
@@ -35,7 +36,7 @@ _REGIONS, _REGION = 2**21, 12  # largest number of voxels in the regions (`metri
 
 
 class Aspect(Flag):
-    """What a volume is judged by, in addition to a ground truth.
+    """The criteria by which a volume is judged, in addition to a ground truth.
 
     RESIDUAL: the residual in up to 16 of the projections used, and in all held-out projections. STRAY: mass where the
     projections show no material. FIT (with RESIDUAL), for a volume fitted to its projections: whether a uniform volume
@@ -63,7 +64,7 @@ class Judgement:
         figures: figures of merit by name: psnr, ssim3d and nrmse from the ground truth; residual, residual_held_out,
             unexplained and stray from the projections.
         held_out: residual in the held-out projections; None if there are none.
-        along_rows: residuals of the volume and of a uniform volume, see `left_by_volume`; None: not compared.
+        along_rows: residuals of the volume and of a uniform volume, see `uniform_residual`; None: not compared.
         unexplained: structure in the residual of the projections; None: not known.
         stray: mass where the projections show no material; None: not computed.
         odd_views: projections with a part that the volume does not explain.
@@ -101,40 +102,53 @@ def judge(
     Raises:
         ValueError: all projections are zero.
     """
-    held_out, views = views.unseen, views.seen
-    figures = {} if truth is None else by_truth(truth.data, volume.data)
-    along_rows, unseen, structure, stray, seconds = None, None, None, None, 0.0
-    odd, skipped, fitted = tuple[OddView, ...](), list[str](), Aspect.FIT in aspects
-    if Aspect.RESIDUAL in aspects:
-        begun = time.now()
-        left, along_rows = left_by_volume(volume, views, _VIEWS, progress, beside_uniform=fitted)
-        figures["residual"], projected = left.residual, left.rays.sum() * (3 if fitted else 1)
-        if held_out is not None:
-            unseen, _ = left_by_volume(volume, held_out, held_out.geometry.n_views, progress)
-            figures["residual_held_out"], projected = unseen.residual, projected + unseen.rays.sum()
-        seconds = (time.now() - begun) * views.data.size / float(projected)
-    if fitted and (structure := unexplained(volume, views, np.random.default_rng(seed))) is not None:
-        figures["unexplained"] = structure.share
+    seen, unseen, grid, begun = views.seen, views.unseen, volume.grid, time.now()
+    fitted, compares, seconds, uniform = Aspect.FIT in aspects, Aspect.RESIDUAL in aspects, 0.0, 0.0
+    if compares and fitted:
+        uniform, rays = uniform_residual(grid, seen, _VIEWS)
+        seconds = (time.now() - begun) * seen.data.size / rays
+    work = stray_mass_share(seen.geometry, grid) if Aspect.STRAY in aspects else 0.0
+    looks_for_odd = fitted and time.leaves((work + _ODD_VIEWS_WORK) * seconds)
 
-    def has_time(work: float, name: str) -> bool:
-        """Whether time remains for this many projections of all views."""
-        enough = work == 0 or time.leaves(work * seconds)
-        skipped.extend([] if enough else [name])
-        return enough
+    used, nothing = np.setdiff1d(np.arange(len(views.data)), views.held_out), RayCheck[Any]((), lambda: None)
+    left = residual(grid, seen, _VIEWS).renumbered(used) if compares else nothing
+    left_unseen = nothing
+    if compares and unseen is not None:
+        left_unseen = residual(grid, unseen, len(unseen.data)).renumbered(views.held_out)
+    structure = unexplained(volume, seen, np.random.default_rng(seed)).renumbered(used) if fitted else nothing
+    odd = odd_views(grid, seen).renumbered(used) if looks_for_odd else nothing
+    parts = [part for check in (left, left_unseen, structure, odd) for part in check.parts]
+    begun = time.now()
+    project_parts(volume, views.geometry, parts, progress)
 
-    work = stray_mass_share(views.geometry, volume.grid)
-    if Aspect.STRAY in aspects and has_time(work, "the check for mass where projections show no material"):
-        stray = stray_mass(volume, views)
-        figures |= {} if stray is None else {"stray": stray.share}
-    if fitted and has_time(_ODD_VIEWS_WORK, "the check for projections that do not fit the volume"):
-        odd = odd_views(volume, views, progress)
-    return Judgement(figures, unseen, along_rows, structure, stray, odd, tuple(skipped), seconds)
+    figures, along_rows, held_out = {} if truth is None else by_truth(truth.data, volume.data), None, None
+    if compares:
+        squares, along = left.result()
+        figures["residual"], along_rows = squares.residual, (along, uniform) if fitted else None
+        if unseen is not None:
+            held_out, _ = left_unseen.result()
+            figures["residual_held_out"] = held_out.residual
+        if not fitted:
+            rays = squares.rays.sum() + (0 if held_out is None else held_out.rays.sum())
+            seconds = (time.now() - begun) * seen.data.size / rays
+    if (hidden := structure.result()) is not None:
+        figures["unexplained"] = hidden.share
+    looks_for_stray = Aspect.STRAY in aspects and (work == 0 or time.leaves(work * seconds))
+    stray = stray_mass(volume, seen) if looks_for_stray else None
+    figures |= {} if stray is None else {"stray": stray.share}
+    skipped = {
+        "the check for mass where projections show no material": Aspect.STRAY in aspects and not looks_for_stray,
+        "the check for projections that do not fit the volume": fitted and not looks_for_odd,
+    }
+    late = tuple(name for name, left_out in skipped.items() if left_out)
+    return Judgement(figures, held_out, along_rows, hidden, stray, odd.result() or (), late, seconds)
 
 
 def judge_memory(geometry: Geometry, *, fitted: bool) -> int:
     """Approximate memory of `judge` and `contrast` in bytes, without projections and volume."""
     grid = Grid.matching(geometry)
-    most = max(unexplained_memory(geometry), stray_mass_memory(geometry, grid), fitted * odd_views_memory(geometry))
+    of_fitted = fitted * odd_views_memory(geometry) + unexplained_memory(geometry)
+    most = max(of_fitted, stray_mass_memory(geometry, grid))
     return max(most, _REGION * min(math.prod(grid.shape), _REGIONS))
 
 

@@ -223,7 +223,7 @@ import math
 from beamline.config.load import config_folder, load
 from beamline.core.errors import ConfigError
 from beamline.instrument.connect import connect
-from beamline.scan.preflight import dry_run
+from beamline.scan.dry_run import dry_run
 from drivers.base.clock import SystemClock
 from beamline.instrument.simulated import WIRES
 

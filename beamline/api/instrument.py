@@ -34,7 +34,7 @@ _OF_A_SCAN = ("roi", "binning", "readout")  # settings of the camera that every 
 
 
 class ScanResult(RunResult):
-    """Result of a scan for scripts and notebooks: a `RunResult` that a notebook can display."""
+    """Result of a scan for scripts and notebooks: a `RunResult` that is also shown well in a notebook."""
 
     def _repr_html_(self) -> str:
         """HTML for a notebook: the middle projection as counts, and the results of the scan and of its monitor."""
@@ -57,11 +57,11 @@ class ScanResult(RunResult):
 
 
 class Instrument:
-    """A connected instrument, made by `connect`. Leaving a `with` block closes its devices.
+    """A connected instrument, made by `connect`. The devices are closed at the end of a `with` block.
 
     Attributes:
         config: the configuration of the devices.
-        last: result of the newest scan, even if that scan raised an error. None before the first scan, or if the newest
+        last: result of the newest scan, even if that scan raised an error; None before the first scan, or if the newest
             scan took no frame.
     """
 
@@ -96,19 +96,20 @@ class Instrument:
         """Run a scan in the same way as `beamline scan`: in a new folder, with a check of every frame, and with a file
         that stays readable after a failure.
 
-        The first Ctrl-C stops the scan cleanly, the second aborts it; both also end a loop over samples. In other
-        threads than the main thread use `stop`, because Python delivers signals only to the main thread.
+        The first Ctrl-C stops the scan cleanly, and the second Ctrl-C aborts it. Both raise an error, so they also end
+        a loop over samples. If this function runs in another thread than the main thread, use `stop` instead of Ctrl-C,
+        because Python delivers signals only to the main thread.
 
         Args:
             sample: name of the sample, which is written to the file and into the folder's name; None: the configured
                 name.
-            energy_kev: energy of the beam, written to the file. If a monochromator is configured, it moves to this
-                energy.
+            energy_kev: energy of the beam, written to the file. If a monochromator is configured, the monochromator
+                moves to this energy.
             set: configuration values for this scan only, such as {"scan.angles.views": 90}.
             output: folder in which the run's folder is created; None: `storage.folder`.
             live: False: without a live reconstruction, even if `recon.live` is on.
             stop: request with which another thread can end the scan.
-            on_event: function that gets every event of the run. The calls come from a separate thread.
+            on_event: function that gets every event of the run. It is called in a separate thread.
 
         Raises:
             ConfigError: a value is wrong, exceeds a limit, or would require opening the devices again. Nothing has
@@ -118,8 +119,8 @@ class Instrument:
             ReferencesError: darks or flats cannot be used.
             ScanStopped: Ctrl-C, `stop`, or a check of the monitor ended the scan; ScanAborted: the scan was aborted.
 
-        In all these cases the frames taken so far are in the file: see `last`. A scan that ends because its
-        projections were enough (`scan.decide`) does not raise an error.
+        In all these cases the frames taken so far are in the file: see `last`. If the scan ends early because it has
+        enough projections (`scan.decide`), no error is raised.
         """
         refuse_wrong_arguments(Instrument.scan, locals())
         if not self._one_at_a_time.acquire(blocking=False):
@@ -188,13 +189,13 @@ def connect(
         config: path of the configuration file.
         set: values that replace values of the file, such as {"scan.angles.views": 90}.
         ask: function that asks the operator to move the shutter or the sample by hand, and returns when the operator
-            has done it. None: ask at the terminal.
+            has done it; None: the operator is asked at the terminal.
         say: function that gets each message that a command would print, for example `print` or the `info` of a logger;
             None: no messages.
 
     Raises:
         ConfigError: the configuration is wrong; the message lists every fault with file, line, key and allowed values.
-        DeviceError: a device does not answer. The devices that were opened before it are closed again.
+        DeviceError: a device does not answer. The devices that are already open are closed again.
     """
     refuse_wrong_arguments(connect, locals())
     read = load(config, [override_of(key, value) for key, value in (set or {}).items()])
@@ -207,8 +208,8 @@ def scan(
 ) -> ScanResult:  # fmt: skip
     """Connect, run one scan, and close the devices.
 
-    Arguments and errors are those of `connect` and `Instrument.scan`. `set` replaces values for the
-    connection and for the scan, so it may also change how the devices are opened.
+    Arguments and errors are those of `connect` and `Instrument.scan`. `set` applies to the connection and to the scan,
+    so it can also change how the devices are opened.
     """
     with connect(config, set=set, ask=ask, say=say) as instrument:
         return instrument.scan(**of_scan)
@@ -226,21 +227,22 @@ def plan(
     a second, not counting the import.
 
     Args:
-        scans: each is one of four things. (1) A configuration file. (2) A table of scans (.csv). (3) A row of such a
-            table as a mapping, such as {"config": "my.yaml", "sample.name": "cell_1", "scan.exposure_s": 0.1}. (4) A
-            plan of bluesky, such as `fly(scan)`; it is read without running it, and cannot be run afterwards.
+        scans: each is a configuration file, a table of scans (.csv), a row of a table of scans as a mapping, such as
+            {"config": "my.yaml", "sample.name": "cell_1", "scan.exposure_s": 0.1}, or a plan of bluesky, such as
+            `fly(scan)`. A plan of bluesky is read without running it, and cannot be run afterwards.
         set: values that replace values in all configurations, such as {"scan.angles.views": 90}.
         output: folder in which the scans would create the folders of their runs; None: `storage.folder`.
         rehearse: plan a real configuration with simulated devices.
         live: False: without live reconstructions, even if `recon.live` is on.
 
     Returns:
-        `scans` in their order, each with `valid`, `faults` (each with message, file and line) and `needs`: `duration`
-        (s) with its `parts`, `n_frames`, `total_bytes`, `dose_gy`, and what the `operator` has to do. The `needs` of
-        the plan itself are the sums over the scans that can run.
+        A plan. The `scans` of the plan are in the order of the argument. Each scan has `valid`, `faults` (each with
+        message, file and line), and `needs`: `duration` (s) with its `parts`, `n_frames`, `total_bytes`, `dose_gy`, and
+        what the `operator` has to do. The `needs` of the plan itself are the sums over the scans that can run.
 
     Raises:
-        ConfigError: an argument has the wrong type. Errors in a scan do not raise; they are listed in its `faults`.
+        ConfigError: an argument has the wrong type. If a scan has an error, nothing is raised: the error is listed in
+            the `faults` of the scan.
     """
     refuse_wrong_arguments(plan, locals())
     described = list[Path | Mapping[str, object] | PlannedScan]()

@@ -71,8 +71,9 @@ def reconstruct(
         binning: number of pixels averaged along each side.
         selection: further options, such as Selection(axis_col=1023.5, steps=(Rings("vo"),)), whose steps are in
             `beamline.projections.corrections`. The arguments above take precedence.
-        output: file for the volume, as for the option -o (.h5, .tif, .npy, ...). The report is written next to it.
-            None: no file is written. If the scan does not fit into the memory, an output file is required.
+        output: file for the volume, as for the option -o (.h5, .tif, .npy, ...). The report is written next to this
+            file. If `output` is None, no file is written. If the scan does not fit into the memory, an output file is
+            required.
         say: function that gets each message that the command would print; None: no messages.
 
     Raises:
@@ -80,7 +81,7 @@ def reconstruct(
         DataError: the path is not a scan, no volume can be made from its data, or the output exists or cannot be
             written.
 
-    If an error is raised, nothing has been written.
+    If an error is raised, no file has been written.
     """
     refuse_wrong_arguments(reconstruct, locals())
     source, chosen = SourceOptions(scan_file(path), frames_per_view=None), _method(method)
@@ -187,7 +188,7 @@ def volumes(run: str | Path) -> Iterator[Volume]:
     iteration ends when the run ends.
 
     Args:
-        run: folder of the run. If the run has already ended, only its last volume is returned.
+        run: folder of the run. If the run has already ended, only the last volume of the run is returned.
 
     Raises:
         DataError: the path is not the folder of a run.

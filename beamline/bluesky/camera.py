@@ -32,7 +32,8 @@ from ophyd_async.core import (
 )
 
 from beamline.bluesky.documents import COLUMNS, file_url
-from beamline.config.load import Config, camera_settings
+from beamline.config.load import Config
+from beamline.config.planned import camera_settings
 from beamline.core.errors import InstrumentError
 from beamline.core.files import SCAN, create_run_folder
 from beamline.instrument.connect import ConnectedDevices

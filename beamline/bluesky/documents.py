@@ -20,7 +20,7 @@ import click
 from beamline.config.load import Config
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Failed, FrameStored, RunDone, RunStarted, ScanDone, Sink, json_of
-from beamline.scan.preflight import dry_run
+from beamline.scan.dry_run import dry_run
 from beamline.storage.writers import layout
 
 Emit = Callable[[str, Mapping[str, Any]], object]

@@ -14,12 +14,12 @@ from bluesky import Msg
 
 from beamline.bluesky.camera import CameraDetector, ShownFrames
 from beamline.bluesky.devices import Rotation, TomoScan
-from beamline.config.load import camera_settings
+from beamline.config.planned import camera_settings
 from beamline.core.errors import ConfigError
 from beamline.core.text import degrees
 from beamline.plan.needs import OperatorRequest, ScanNeeds, all_needs
 from beamline.plan.timeline import move_seconds, row_bytes
-from beamline.scan.preflight import disk_of
+from beamline.scan.dry_run import disk_of
 from beamline.scan.queue_plan import PlannedScan, ScanFault
 from beamline.scan.queue_planning import plan_of_config
 from drivers.base.protocols import TriggerSource

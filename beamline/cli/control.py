@@ -353,7 +353,7 @@ def check(file: Path, overrides: tuple[str, ...], rehearse: bool, connect: bool,
     Exit code: 0 valid, 2 wrong configuration or violated limit, 3 a device does not answer.
     """
     from beamline.config.load import load
-    from beamline.scan.preflight import doubts, dry_run, refuse_violations
+    from beamline.scan.dry_run import doubts, dry_run, refuse_violations
 
     with json_events(as_json) as sink:
         loaded = load(file, overrides, rehearse=rehearse)

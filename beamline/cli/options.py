@@ -27,8 +27,9 @@ from recon.methods import METHODS
 
 
 def _within(bounds: click.FloatRange | click.IntRange, number: Any, *place: Any) -> Any:
-    """Returns the number if it is within the bounds. Otherwise raises a usage error with the message that the setting
-    has in Python."""
+    """Returns the number if it is within the bounds. Otherwise raises a usage error with the same message as in
+    Python.
+    """
     low, high = "gt" if bounds.min_open else "ge", "lt" if bounds.max_open else "le"
     limits: dict[str, Any] = {low: bounds.min, high: bounds.max}
     if fault := Setting(**limits).fault(number):

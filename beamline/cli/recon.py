@@ -159,8 +159,9 @@ def _in_time() -> str:
 
 
 def refuse_recipe(config: Path) -> None:
-    """Raise UsageError if options of a recipe exclude each other, or do not belong to its method, whatever the scan is.
-    The error is shown as an error of the command that calls this function."""
+    """Raise UsageError if options of a recipe exclude each other or do not belong to its method. The scan plays no
+    role. The error is shown as an error of the command that calls this function.
+    """
     try:
         with recon.make_context("beamline recon", ["SCAN", "--config", str(config)]) as context:
             values = dict(context.params)

@@ -211,7 +211,7 @@ def _ask_about(config: Config, *, asked: bool) -> None:
     Raises:
         ConfigError: they are not intended. Nothing has moved.
     """
-    from beamline.scan.preflight import doubts
+    from beamline.scan.dry_run import doubts
 
     sentences = doubts(config)
     for sentence in sentences:
@@ -223,7 +223,7 @@ def _ask_about(config: Config, *, asked: bool) -> None:
 def rehearsed_lines(config: Config, result: RunResult, request: ScanRequest) -> list[str]:
     """The duration of the rehearsal, and of the scan at the instrument, as lines."""
     from beamline.plan.timeline import hms_text
-    from beamline.scan.preflight import dry_run
+    from beamline.scan.dry_run import dry_run
 
     planned = hms_text(dry_run(config, request.output).timeline.duration)
     return [
@@ -375,7 +375,7 @@ def _treated(path: Path) -> str:
 
 
 def _dry_run(config: Config, output: Path | None, series: ResumableRun | None, json_sink: Sink, as_json: bool) -> None:
-    from beamline.scan.preflight import dry_run, refuse_violations
+    from beamline.scan.dry_run import dry_run, refuse_violations
 
     worked = dry_run(config, output) if series is None else dry_run(config, series.run, series.remaining)
     if not as_json:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -14,20 +14,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from beamline.config.beam import StageMover
-from beamline.config.devices import DcamOrca
+from beamline.config.faults import faults
 from beamline.config.models import Config as Config
 from beamline.config.models import (
-    Fields,
-    FileAngles,
     FixedAngles,
     GoldenAngles,
     InterlacedAngles,
     RandomAngles,
-    SectorAngles,
 )
 from beamline.config.rehearsal import rehearsal
 from beamline.config.section import Section
@@ -36,10 +31,7 @@ from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, kind_of_data, text_in
 from beamline.core.installed import config_folder as config_folder
 from beamline.core.installed import version
-from beamline.core.quantities import doubt, is_impossible
-from beamline.plan import plan as plans
-from beamline.plan.plan import FieldPlan, Mode, Place, ScanPlan
-from drivers.base.protocols import CameraSettings, TriggerSource
+from beamline.plan.plan import Place
 from recon.base.findings import declared_at
 
 AnySection = TypeVar("AnySection", bound=Section)
@@ -48,13 +40,13 @@ NO_LIVE = ("recon.live=false", "scan.decide=off")
 """Overrides of a run without a reconstruction."""
 
 NO_DECISIONS = "scan.decide {} needs a live reconstruction, and this scan has none, so the scan follows its plan."
-"""Sentence for the operator of such a run, if the scan would otherwise make decisions."""
+"""Message to the operator of a run without a reconstruction, if the scan would otherwise make decisions."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReadConfig:
-    """A configuration in which each single value is legal, the place of each value, and the faults of the values
-    together (place and sentence).
+    """A configuration in which each single value is legal. Also the place of each value, and the faults that concern
+    several values together (place and sentence).
     """
 
     config: Config
@@ -125,7 +117,9 @@ def load_as(model: type[AnySection], path: Path, overrides: Iterable[str] = (), 
         printed_by: the command that prints an example.
     """
     legal = model.model_json_schema()
-    tree = override(_read_file(path, printed_by), overrides, {}, lambda keys: takes_text(keys, legal))
+    tree = _read_file(path, printed_by)
+    _locate(tree.data, path.parent)
+    tree = override(tree, overrides, {}, lambda keys: takes_text(keys, legal))
     try:
         return model.model_validate(tree.data)
     except ValidationError as error:
@@ -164,7 +158,8 @@ def changed(config: Config, overrides: Iterable[str]) -> Config:
 
 
 def each_scan(config: Config) -> tuple[Config, ...]:
-    """The configuration of each scan of a series (`scan.energies`, `scan.states`); that of a single scan itself.
+    """The configuration of each scan of a series (`scan.energies`, `scan.states`). For a single scan, the result
+    contains only its own configuration.
 
     The n-th of N scans begins n / N of an angular step later, or has another random seed. So all scans together contain
     more angles.
@@ -236,38 +231,6 @@ def schema() -> dict[str, Any]:
     return Config.model_json_schema()
 
 
-def plan_of(config: Config) -> ScanPlan:
-    """The scan that a configuration asks for.
-
-    Raises:
-        ConfigError: an angle file cannot be read, or the projections cannot be divided into the passes.
-    """
-    scan = config.scan
-    try:
-        theta = _angles(scan.angles)
-    except (ValueError, OSError) as error:
-        where = f"scan.angles.path: {scan.angles.path}" if isinstance(scan.angles, FileAngles) else "scan.angles"
-        raise ConfigError(f"{where}: {error}. Nothing was started.") from None
-    return ScanPlan(
-        angles=np.repeat(theta, scan.frames_per_view),
-        frames_per_view=scan.frames_per_view,
-        mode=scan.mode,
-        exposure=scan.exposure_s,
-        period=scan.period_s,
-        settle=scan.settle_s,
-        warm_up=scan.warm_up_s,
-        offset_views=scan.offset_views,
-        offset_places=offset_places(config),
-        filter=scan.filter,
-        energy=scan.energy,
-        darks=_field(scan.darks, scan.exposure_s),
-        flats=_field(scan.flats, scan.exposure_s),
-        scheme=scan.angles.scheme,
-        pass_views=scan.pass_views,
-        retake_share=config.monitor.retake_share if config.monitor.retake else 0.0,
-    )
-
-
 def scene_mapping(config: Config) -> dict[str, Any]:
     """The simulated scene as plain values, read from its file if the configuration names one.
 
@@ -285,27 +248,6 @@ def scene_mapping(config: Config) -> dict[str, Any]:
             f"simulation.scene: {path} cannot be read ({error.strerror or error}). Nothing was started."
         ) from None
     return read(text, str(path)).data
-
-
-def _angles(plan: Any) -> NDArray[np.float64]:
-    match plan:
-        case SectorAngles():
-            return plans.sector(plan.views, math.radians(plan.first_deg), math.radians(plan.last_deg))
-        case FileAngles():
-            return plans.from_text(text_in(Path(plan.path)))
-    start, span = math.radians(plan.start_deg), math.radians(plan.span_deg)
-    match plan:
-        case RandomAngles():
-            return plans.random(plan.views, start, span, rng=np.random.default_rng(plan.seed))
-        case InterlacedAngles():
-            return plans.interlaced(plan.views, plan.passes, start, span)
-        case GoldenAngles():
-            return plans.golden(plan.views, start, span)
-    return plans.fixed(plan.views, start, span)
-
-
-def _field(fields: Fields, exposure: float) -> FieldPlan:
-    return FieldPlan(fields.count, fields.at, exposure if fields.exposure_s is None else fields.exposure_s)
 
 
 def _locate(data: Any, folder: Path) -> None:
@@ -332,121 +274,3 @@ def _group(data: Any, *path: str) -> dict[str, Any] | None:
     for name in path[:-1]:
         data = data.get(name) if isinstance(data, dict) else None
     return data if isinstance(data, dict) and isinstance(data.get(path[-1]), str) else None
-
-
-def faults(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Key path and message of each fault. shipped: folder with the configurations that come with the package."""
-    yield from _files(config, shipped)
-    yield from _camera(config)
-    yield from _triggers(config)
-    numbers = ((at, ".".join(at), value) for at, value in quantities(config.model_dump(exclude={"simulation"})))
-    yield from ((at, doubt(name, value)) for at, name, value in numbers if is_impossible(name, value))
-    try:
-        offset_places(config)
-    except ValueError as error:
-        yield ("scan", "offset_views"), f"scan.offset_views {config.scan.offset_views}: {error}"
-
-
-def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str]]:
-    angles, simulation = config.scan.angles, config.simulation
-    if isinstance(angles, FileAngles) and not Path(angles.path).is_file():
-        yield (
-            ("scan", "angles", "path"),
-            f"scan.angles.path: there is no file {angles.path}; expected a file with the angles in degrees",
-        )
-    if config.recon.reference is not None and not Path(config.recon.reference).exists():
-        yield (
-            ("recon", "reference"),
-            f"recon.reference: there is no file {config.recon.reference}; expected a volume of the same sample, or its "
-            "scan",
-        )
-    scene = simulation.scene if simulation is not None else None
-    if isinstance(scene, str) and not (shipped / scene).is_file():
-        scenes = " | ".join(f"scenes/{path.name}" for path in sorted((shipped / "scenes").glob("*.yaml")))
-        at = ("simulation", "scene")
-        yield (
-            at,
-            f"simulation.scene: there is no file {scene}; expected one next to the configuration file, or {scenes}",
-        )
-
-
-def quantities(values: Any, at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], float]]:
-    """Key path and value of each number in plain values. If a key has several numbers, they share its path."""
-    if isinstance(values, dict | list | tuple):
-        for name, each in values.items() if isinstance(values, dict) else ((None, each) for each in values):
-            yield from quantities(each, at if name is None else (*at, str(name)))
-    elif isinstance(values, int | float) and not isinstance(values, bool):
-        yield at, values
-
-
-_ONE_FRAME_A_PULSE = {"trigger_mode": ("normal",), "trigger_times": (1,), "trigger_active": ("edge", "level")}
-
-
-def _triggers(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Faults of camera settings: with them, a pulse of a fly scan would not give one frame of the planned exposure."""
-    camera, stage, scan = config.devices.camera, config.devices.stage, config.scan
-    if not isinstance(camera, DcamOrca) or scan.mode is not Mode.FLY:
-        return
-    for key, fit in _ONE_FRAME_A_PULSE.items():
-        if (value := getattr(camera, key)) not in fit:
-            expected = f"expected {' | '.join(map(str, fit))}, or scan.mode: step"
-            what = f"devices.camera.{key} {value} does not give one frame per pulse, which a fly scan needs; {expected}"
-            yield ("devices", "camera", key), what
-    width = stage.settings.pulse_width
-    if camera.trigger_active == "level" and (width is None or abs(width - scan.exposure_s) > 0.01 * scan.exposure_s):
-        yield (
-            ("devices", "camera", "trigger_active"),
-            "with devices.camera.trigger_active: level, the exposure lasts as long as the pulse. Set "
-            f"devices.stage.pulse_width_s (now {width}) to the value of scan.exposure_s ({scan.exposure_s:g}), or set "
-            "devices.camera.trigger_active to edge",
-        )
-
-
-def camera_settings(config: Config, exposure: float, trigger: TriggerSource) -> CameraSettings:
-    """The configured region, binning and readout with an exposure (s) and a trigger source."""
-    camera = config.devices.camera
-    return CameraSettings(exposure, trigger, camera.roi, camera.binning, camera.readout)
-
-
-def offset_places(config: Config) -> tuple[float, ...]:
-    """Positions of the sample in mm for laterally offset projections. They are 0.9 of the field of view apart, and end
-    when a twentieth of the field of view shows air beyond the sample, on both sides. Raises ValueError with the reason
-    if this is impossible.
-    """
-    mover, camera, diameter = config.devices.sample_mover, config.devices.camera, config.sample.diameter_mm
-    if not config.scan.offset_views:
-        return ()
-    if diameter is None:
-        raise ValueError("set sample.diameter_mm, which determines how far the sample is stepped")
-    per_unit = mover.mm_per_deg if isinstance(mover, StageMover) else float(mover.kind == "simulated")
-    if not per_unit:
-        raise ValueError("devices.sample_mover cannot step the sample: set its kind to stage, and its mm_per_deg")
-    settings, axis = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL), config.optics.axis_col
-    cols = camera.timing_of(settings).shape[1]
-    field = 1e-3 * config.optics.pixel_size_um * camera.binning * cols
-    off_middle = 0.0 if axis is None else abs((axis + 0.5) / cols - 0.5)
-    n = math.ceil((diameter / field / 2 + off_middle - 0.45) / 0.9)
-    if n < 1:
-        raise ValueError(
-            f"the field of view of {field:.4g} mm shows all of a sample of {diameter:.4g} mm; set "
-            "scan.offset_views to 0"
-        )
-    places = tuple(0.9 * field * step for step in range(-n, n + 1) if step)
-    if isinstance(mover, StageMover):
-        mover.refuse_unreachable(
-            {f"the position for an offset of {mm:.4g} mm,": mover.in_deg + mm / per_unit for mm in places}
-        )
-    return places
-
-
-def _camera(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
-    camera = config.devices.camera
-    settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
-    try:
-        timing = camera.timing_of(settings)
-    except ValueError as error:
-        yield ("devices", "camera"), f"devices.camera: {error}"
-        return
-    axis, last = config.recon.axis, timing.shape[1] - 1
-    if isinstance(axis, float) and not -0.5 <= axis <= last + 0.5:
-        yield ("recon", "axis"), f"recon.axis {axis:g} lies outside the frame's columns 0 ... {last}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
@@ -293,6 +294,13 @@ class ReconSection(Section):
     def chosen_method(self) -> str:
         """The method of the volume: `method`, or the one that uses the reference if there is one."""
         return self.method if self.reference is None or WITH_REFERENCE is None else WITH_REFERENCE
+
+    @property
+    def missing_reference(self) -> str | None:
+        """The error if there is no file with the name of the reference."""
+        if self.reference is None or Path(self.reference).exists():
+            return None
+        return f"recon.reference: there is no file {self.reference}; expected a volume of the same sample, or its scan"
 
 
 class Speed(Section):

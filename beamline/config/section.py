@@ -73,7 +73,7 @@ def _inside(made: Setting, kind: Any, value: Any) -> Any:
 
 
 def _is(kind: Any, *kinds: type[Any]) -> bool:
-    """True if the type is a class of one of these kinds, and not a union."""
+    """True if the type is a single class (not a union) that derives from one of these classes."""
     return isinstance(kind, type) and issubclass(kind, kinds)
 
 

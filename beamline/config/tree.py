@@ -33,8 +33,8 @@ _TOO_MUCH = (
     f"this is more than settings may have: at most {_LONGEST} characters, {_MOST} values, {_DEEPEST} "
     f"nested groups and numbers of {_DIGITS} digits. Nothing was started."
 )
-_QUOTED = re.compile(r"""(?m)"(?:\\.|[^"\\])*"|'[^']*'|(?:^|(?<=\s))#.*$""")  # and remarks
-# one after the other; for a thousand of them, PyYAML needs a second
+_QUOTED = re.compile(r"""(?m)"(?:\\.|[^"\\])*"|'[^']*'|(?:^|(?<=\s))#.*$""")  # and the same for remarks
+# one bracket after the other; PyYAML needs a second for a thousand of them
 _BRACKETS = re.compile(rf"(?:[\[{{]\s*){{{_DEEPEST}}}")
 _TAGGED = "text that begins with ! or = needs quotes"
 _NO_SPACE = re.compile(r"[\s-]*[\w.]+:[^\s:/\\]")

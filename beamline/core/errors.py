@@ -27,11 +27,11 @@ class BeamlineError(Exception):
 
 
 class ConfigError(BeamlineError):
-    """Wrong usage or configuration; nothing was started.
+    """An argument or the configuration is wrong. Nothing was started.
 
     Args:
-        faults: list of single errors. Each error has the place of the value (`my.yaml:12`) and a sentence without its
-            full stop. Empty if the message is complete without the list.
+        faults: list of single errors. Each error has the place of the value (`my.yaml:12`) and a sentence without a
+            full stop. The list is empty if the message is complete without it.
     """
 
     exit_code = 2

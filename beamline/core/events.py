@@ -58,7 +58,7 @@ class Event:
 
     @property
     def data(self) -> dict[str, Any]:
-        """The values of the event by name, as in its JSON line."""
+        """The values of the event by name, as they are written to JSON."""
         values: dict[str, Any] = {}
         own_fields = [each for each in fields(self) if each.name not in ("time", "source", "scan")]
         for each in (*own_fields, *(each for each in fields(Event) if each.name != "time")):
@@ -189,7 +189,7 @@ class PassEnded(Event, event="pass_ended"):
         n_views: number of projections so far.
         options: what can be measured next, as values of `beamline.plan.choose.PassOption`: choice, frames, seconds,
             dose (as a fraction of the dose of the plan), bytes, and the expected improvement in dB with its range
-            (gain, low, high; None: not known).
+            (`gain`, `low`, `high`; None: not known).
         recommended: the choice that the program makes, or would make if it need not ask.
         wait: real time in s for which the scan waits for the operator's answer; 0 if nobody is asked.
         remark: a sentence that says why no gain is known; empty if gains are known.

@@ -185,10 +185,10 @@ def text_in(path: Path, largest: int = TEXT) -> str:
 
 
 def decoded(content: bytes, errors: str = "strict") -> str:
-    """Text with \n for any end of line, by its byte-order mark if it has one.
+    """Decode the content of a text file, with \n for every kind of line end. A byte-order mark states the encoding.
 
     Args:
-        errors: "replace" what is no text; "strict": UnicodeDecodeError.
+        errors: "replace": bytes that are not text are replaced; "strict": they raise UnicodeDecodeError.
     """
     utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     return content.decode("utf-16" if utf16 else "utf-8-sig", errors).replace("\r\n", "\n").replace("\r", "\n")
@@ -203,13 +203,13 @@ def broken_link(path: Path) -> str:
 
 
 def no_file(path: Path) -> str:
-    """A sentence on a path that does not name a regular file."""
+    """A sentence that says that a path does not name a regular file."""
     kind = f"is {'a folder' if path.is_dir() else 'a device or a pipe'}, and a file is expected"
     return broken_link(path) or f"{path} {kind if path.exists() else 'does not exist'}."
 
 
-# number of bytes by which names of temporary files, and of files next to an output, are longer than the name of the
-# output
+# names of temporary files, and of files next to an output, are longer than the name of the output by this number of
+# bytes
 _BESIDE = 44
 
 
@@ -274,7 +274,7 @@ def same_file(first: Path, second: Path) -> bool:
 def replaceable(path: Path) -> Path:
     """The file to replace or create for `path`. If `path` is a link, this is the target of the link.
 
-    DataError if the target does not exist.
+    Raises DataError if the target does not exist.
     """
     if link := broken_link(path):
         raise DataError(
@@ -284,7 +284,7 @@ def replaceable(path: Path) -> Path:
 
 
 def to_disk(handle: int) -> None:
-    """Wait until all data written to an open file are on the disk. OSError if writing failed."""
+    """Wait until all data written to an open file are on the disk. Raises OSError if the disk failed."""
     try:
         os.fsync(handle)
     except OSError as error:
@@ -293,7 +293,7 @@ def to_disk(handle: int) -> None:
 
 
 def bring_to_disk(path: Path) -> None:
-    """Wait until a file, or every file in a folder, is on the disk. OSError if writing failed."""
+    """Wait until a file, or every file in a folder, is on the disk. Raises OSError if the disk failed."""
     for part in path.rglob("*") if path.is_dir() else (path,):
         if part.is_file():
             with part.open("r+b") as file:  # Windows needs a file opened for writing

@@ -199,8 +199,9 @@ class StopRequest:
     """A request to stop a scan (finish cleanly with fewer frames) or to abort it (end at once). A request cannot be
     undone.
 
-    Any thread or signal handler can make the request. A signal handler may interrupt another handler. It would then
-    wait for ever for a lock of the other handler. Therefore a single assignment sets each flag, without a lock.
+    Any thread or signal handler can make the request. No lock is used: a signal handler may interrupt another handler,
+    and would then wait for ever for a lock that the interrupted handler holds. Instead, a single assignment sets each
+    flag.
 
     Args:
         now: a clock that gives real time in s.
@@ -226,7 +227,8 @@ class StopRequest:
         returns.
 
         Args:
-            by_itself: True if the scan itself requests the stop, because its frames show that no more are needed.
+            by_itself: True if the scan itself requests the stop, because the frames so far show that no more frames are
+                needed.
         """
         self.by_person = self.by_person or not by_itself
         self.reason = self.reason or reason

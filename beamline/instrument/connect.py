@@ -28,7 +28,8 @@ from beamline.config.beam import (
     StageOutputShutter,
 )
 from beamline.config.devices import DcamOrca, SimulatedOrca
-from beamline.config.load import Config, camera_settings
+from beamline.config.load import Config
+from beamline.config.planned import camera_settings
 from beamline.core.errors import ConfigError
 from drivers.base.clock import Clock, SystemClock
 from drivers.base.protocols import (
@@ -170,7 +171,7 @@ class ConnectedDevices:
 
     @property
     def truth(self) -> Callable[[Grid], Volume] | None:
-        """See Simulated.truth; None for a real instrument."""
+        """The ground truth of the scene, see `Simulated.truth`; None for a real instrument."""
         return None if self.simulated is None else self.simulated.truth
 
     def __enter__(self) -> Self:
@@ -191,7 +192,8 @@ def connect(
         check_stop: function that is called repeatedly during waits; an exception from it ends the wait.
 
     Raises:
-        DeviceError: a device does not answer. The devices that were opened before it are closed again.
+        DeviceError: a device does not answer. Before the error is raised, the devices that were opened are closed
+            again.
         ConfigError: the simulated scene is wrong.
     """
     with ExitStack() as opened:

@@ -51,7 +51,7 @@ from simulators.wires.wire import Build, Controller, register
 
 
 def _fitting(name: str, build: type[Build]) -> type[Build]:
-    """The class, if it can build a simulated controller."""
+    """Return the class if it can build a simulated controller. Otherwise raise AttributeError."""
     _ = build.matching
     return build
 
@@ -146,7 +146,7 @@ def _is_at_level(controller: Controller, shutter: StageOutputShutter) -> bool:
 
 
 def _place_of(mover: StageMover, axis: TriggerLine, clock: Clock) -> float | None:
-    """Distance of the sample from its position, in mm across the beam; None: the sample is out of the beam."""
+    """Distance in mm, across the beam, of the sample from its usual position; None: the sample is out of the beam."""
     place, mm = math.degrees(axis.angle_at(clock.now())), mover.mm_per_deg
     is_out = abs(place - mover.out_deg) < IN_PLACE if mm else abs(place - mover.in_deg) >= IN_PLACE
     return None if is_out else (mm or 0.0) * (place - mover.in_deg)
@@ -155,7 +155,7 @@ def _place_of(mover: StageMover, axis: TriggerLine, clock: Clock) -> float | Non
 def _wire(device: str, stage: StageSection, clock: Clock, axis: TriggerLine) -> tuple[Controller, str]:
     """A simulated controller that turns `axis`, and its port. Two controllers in one process must not share a port.
 
-    ConfigError: the controller does not have a function that the section of the device uses.
+    ConfigError: the controller lacks a function that the section of the device uses.
     """
     try:
         controller = WIRES[stage.kind].matching(stage.settings).controller(clock, axis)
@@ -187,7 +187,7 @@ def scene_of(config: Config, energy: float | None = None) -> Scene:
         mapping = mapping | {"beam": beam | {"energy_kev": energy}}
     try:
         phantom = mapping.get("phantom")
-        of_files = isinstance(phantom, dict) and not {"file", "labels"}.isdisjoint(phantom)  # which may change
+        of_files = isinstance(phantom, dict) and not {"file", "labels"}.isdisjoint(phantom)  # these may change
         if of_files:
             scene = load_scene(mapping, volumes_beside(folder))
         else:

@@ -24,9 +24,9 @@ class DeviceState:
     """Identity and status of a device, or why it cannot be used.
 
     Attributes:
-        name: of the device.
-        fault: why it cannot be used; "" if it answers.
-        values: its identity, settings and state, by name.
+        name: name of the device.
+        fault: the reason why the device cannot be used; "" if it answers.
+        values: identity, settings and state of the device, by name.
     """
 
     name: str
@@ -61,7 +61,7 @@ def device_states(config: Config, clock: Clock, usb: Any = None) -> Iterator[Dev
 
 
 def _link(camera: DcamOrca, usb: Any) -> DeviceState:
-    """The camera on USB, from its USB descriptors, which also show a slow link that would lose frames."""
+    """The camera on USB, from its USB descriptors. These also show a slow link that would lose frames."""
     session = import_module(f"drivers.{camera.kind}.session")
     found = session.preflight(product=camera.usb_product, serial=camera.usb_serial, backend=usb)
     usable = found.verdict not in (session.Verdict.SLOW, session.Verdict.ABSENT)

@@ -138,7 +138,7 @@ def _runs(marked: NDArray[np.bool_], step: float) -> list[tuple[int, int]]:
     return [(round(first * step), round(after * step)) for first, after in edges.reshape(-1, 2).tolist()]
 
 
-CALIBRATION = 10  # projections
+CALIBRATION = 10  # number of projections
 SIGMAS = 6.0
 EMPTY = 1e-3  # mean line integral below which the field of view is empty
 

@@ -23,7 +23,7 @@ from drivers.base.frame import Frame
 from recon.base.setting import setting
 
 EVERY = math.radians(5)  # radians between kept projections
-MOST = 36  # number of them in 180°
+MOST = 36  # number of kept projections in 180°
 BESIDE = 1.01  # largest distance, in steps, of a projection from the wanted angle; a hundredth is rounding
 # largest motion of the rim, in cells, within this distance; the kept projection is extrapolated with its velocity
 REACH = 2.0
@@ -32,14 +32,14 @@ LEAST_SHIFT, LEAST_REMAINDER, LEAST_AXIS = 0.05, 0.5, 0.25
 """Limits as shares of a cell, for large frames, in which a cell is many pixels wide. With these limits, one clean
 simulated scan (the 44th, because of its remainder) and no measured scan is reported in tests/beamline/findings.json."""
 SIGMAS = 8.0  # standard deviations of the noise that a shift must have
-SHAKEN = 5.0  # standard deviations of the places of single views, where the sample shakes
+SHAKEN = 5.0  # standard deviations of the positions of single projections, if the sample shakes
 FEWEST = 16  # smallest number of columns that both projections must share
 TURNS = 6  # number of rounds of the fit
 SEARCH = 0.4  # twice the largest distance of the axis from the middle, as a share of the field of view
 NOISY = 2.0  # smallest remainder, as a multiple of the noise
 SMOOTH = 1.0  # cells: standard deviation by which both are smoothed, so that fractions of a cell shift sharp edges well
 SMOOTHER = 1 / (4 * math.pi * SMOOTH**2)  # variance of the noise after this smoothing, divided by that before
-LEAST_OVERLAP = 0.3  # of the columns
+LEAST_OVERLAP = 0.3  # share of the columns
 
 Reals = NDArray[np.float64]
 

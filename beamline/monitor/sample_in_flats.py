@@ -25,10 +25,12 @@ LIKER = 0.5
 CLIPPED = 0.2
 # flats show the sample if projections are brighter than flats at some places, by this share of the absorption elsewhere
 BRIGHTER = 0.5
-LIGHTER = 0.5  # of the least mass of the sample, below which the mass in the views is too little: it is 1.09 of it or
-# more where flats are clean (60 simulated scans, 53 with other faults), and 0.01 with the sample in all flats
-AIR = 0.1  # line integral at the edges of the field from which they are no air
-EDGE = 16  # one column in so many, at each edge, is taken for air
+# the projections contain too little mass if they have less than this share of the smallest mass of the sample. The
+# ratio is 1.09 or more if flats are clean (60 simulated scans, 53 with other faults), and 0.01 if the sample is in all
+# flats
+LIGHTER = 0.5
+AIR = 0.1  # line integral at the edges of the field of view, above which the edges are not air
+EDGE = 16  # this share of the columns at each edge is assumed to be air
 # smallest number of projections with beam; percent of them that may count as having the least sample at a place
 FEWEST, SHALLOW = 8, 10.0
 OF_SHALLOW = 1.2816  # standard deviations; SHALLOW percent of normal noise are lower than this, and are not material

@@ -30,11 +30,12 @@ from beamline.monitor.view import (
 )
 from drivers.base.frame import Frame, FrameKind
 
-# line integral at the edges up to which the whole sample counts as inside the field of view, as for the check `field`
+# line integral at the edges up to which the whole sample counts as being inside the field of view, as for the check
+# `field`
 AIR = 0.1
 FORGET = 0.99  # weight per projection, because material that was at the edge 90° ago may come back
-NEAREST, FARTHEST = 0.25, MOST_STEPS + 0.5  # planned steps from a view to its neighbour
-SAME, SAME_ANGLE = 0.1, math.radians(0.02)  # planned steps, or rad where they are not known, within a view
+NEAREST, FARTHEST = 0.25, MOST_STEPS + 0.5  # planned steps from a projection to its neighbour
+SAME, SAME_ANGLE = 0.1, math.radians(0.02)  # planned steps (rad, if the steps are not known) within one projection
 ONE_WAY = 0.75  # share of the steps that must have one direction; golden angles have 0.62
 # angle between projections that are kept for later projections near them; number of kept projections
 EVERY, MOST = math.radians(5), 72

@@ -91,7 +91,7 @@ class RunValues:
 
 
 def choice_of(values: RunValues, word: str) -> Choice:
-    """The choice that the operator's word stands for. Raises ConfigError if this choice is not possible now."""
+    """The choice that a word of the operator stands for. Raises ConfigError if this choice is not possible now."""
     if word in values.options and word in [*Choice]:  # the log of another version may have other choices
         return Choice(word)
     offer = f"possible: {', '.join(values.options)}" if values.options else "no pass has ended yet"
@@ -204,7 +204,7 @@ class FollowedRun:
         now: a clock, s since the Unix epoch.
 
     Attributes:
-        stamped: its values, as of the last look.
+        stamped: the values of the run at the last look.
     """
 
     def __init__(self, runs: Path, now: Callable[[], float] = time.time) -> None:
@@ -230,7 +230,7 @@ class FollowedRun:
     def look(self) -> StampedValues:
         """The current values."""
         with self._lock:
-            with suppress(ConfigError, DataError):  # there is no run so far
+            with suppress(ConfigError, DataError):  # there has been no run so far
                 self.stamped = self._read()
             return self.stamped
 

@@ -137,10 +137,10 @@ class Recording:
         views = views[views >= first]
         packed = self._scan.data.id.get_create_plist().get_nfilters() > 0  # each row would cost reading a whole frame
         source, bin_of_source = (self._preview, self.preview_bin) if packed else (self._scan.data, 1)
-        at = min(max(row // bin_of_source, 0), source.shape[1] - 1)
+        row_of_source = min(max(row // bin_of_source, 0), source.shape[1] - 1)
         hdf5.look_again(source)
         factor = max(1, -(-source.shape[2] // MOST))
-        lines = [bin_mean(source[int(view), at : at + 1], (1, factor)) for view in views]
+        lines = [bin_mean(source[int(view), row_of_source : row_of_source + 1], (1, factor)) for view in views]
         return (
             np.concatenate([np.empty((0, -(-source.shape[2] // factor)), np.float32), *lines]),
             views,

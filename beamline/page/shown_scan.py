@@ -63,11 +63,11 @@ class _OverFlats:
         if self._light is not None:
             with np.errstate(divide="ignore", invalid="ignore"):
                 views = (views - self._zero) / self._light
-        for at, view in zip(np.arange(self.shape[0])[part], views, strict=True):
-            if np.isnan(self.light[at]):
+        for number, view in zip(np.arange(self.shape[0])[part], views, strict=True):
+            if np.isnan(self.light[number]):
                 finite = np.isfinite(view)
-                self.light[at] = view[finite].mean() if finite.any() else 0.0
-                self.total += np.where(finite, view, self.light[at])
+                self.light[number] = view[finite].mean() if finite.any() else 0.0
+                self.total += np.where(finite, view, self.light[number])
         return views
 
     def _mean(self, kind: FrameKind) -> F32 | None:
@@ -136,8 +136,11 @@ class ShownScan:
             axis, origin = self._source.axis_col, "from the file"
         elif not is_cone:
             with suppress(ValueError):
-                found = find_axis(self._lines, self._source.table.angles[self._ids])
-                axis, origin = found.value, f"found from row {row}{'' if found.confident else ', not a clear optimum'}"
+                estimate = find_axis(self._lines, self._source.table.angles[self._ids])
+                axis, origin = (
+                    estimate.value,
+                    f"found from row {row}{'' if estimate.confident else ', not a clear optimum'}",
+                )
         return {"axis": round(axis, 2), "said": origin, "leans": not is_cone}
 
     def fbp(self, row: int, axis_col: float, tilt_deg: float, region: TileRegion, *, fast: bool) -> VolumeTile:
@@ -165,8 +168,8 @@ class ShownScan:
         else:
             line = self._line(data, row, tilt_deg)[:, : data.shape[2] // step * step]
             data = line.reshape(len(line), 1, -1, step).mean(axis=3)
-            at, pitch = (axis_col - (step - 1) / 2) / step, step * geometry.pixel_pitch
-            geometry = Geometry.parallel(angles, data.shape[1:], pixel_pitch=pitch, axis_col=at)
+            binned_axis, pitch = (axis_col - (step - 1) / 2) / step, step * geometry.pixel_pitch
+            geometry = Geometry.parallel(angles, data.shape[1:], pixel_pitch=pitch, axis_col=binned_axis)
         ny, nx = (-(-(last - begin) // step) for begin, last in ends)
         y, x = ((begin + (m * step - n) / 2) * voxel for (begin, _), m in zip(ends, (ny, nx), strict=True))
         values = direct(np.ascontiguousarray(data), geometry, Grid((1, ny, nx), step * voxel, (height, y, x)), "hann")
@@ -226,7 +229,9 @@ class ShownScan:
         assert turned is not None
         (rows,), (cols,) = turned.places((1, data.shape[2]), row)
         rows, cols = np.clip(rows - self._band.start, 0, data.shape[1] - 1), np.clip(cols, 0, data.shape[2] - 1)
-        r, c = (np.minimum(at, n - 2).astype(int) for at, n in ((rows, data.shape[1]), (cols, data.shape[2])))
+        r, c = (
+            np.minimum(positions, n - 2).astype(int) for positions, n in ((rows, data.shape[1]), (cols, data.shape[2]))
+        )
         down, across = (rows - r).astype(np.float32), (cols - c).astype(np.float32)
         upper, lower = ((1 - across) * data[:, k, c] + across * data[:, k, c + 1] for k in (r, r + 1))
         return np.asarray((1 - down) * upper + down * lower)

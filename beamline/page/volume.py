@@ -63,8 +63,8 @@ class ScaledSlices:
         square = [(scale, steps) for scale, steps in self._scales if steps[sides[0]] == steps[sides[1]]]
         fine = sum(steps[sides[0]] <= shown.binning() for _, steps in square)
         for scale, steps in square[fine - 1 :]:
-            bin_, at = steps[sides[0]], min(index // steps[axis], scale.shape[axis] - 1)
-            first, end = [at] * 3, [at + 1] * 3
+            bin_, slice_ = steps[sides[0]], min(index // steps[axis], scale.shape[axis] - 1)
+            first, end = [slice_] * 3, [slice_ + 1] * 3
             for i, edges in zip(sides, shown.slices, strict=True):
                 first[i] = min(edges.start // bin_, scale.shape[i] - 1)
                 end[i] = min(-(-edges.stop // bin_), scale.shape[i])
@@ -260,7 +260,7 @@ class ShownVolume:
         values, shown, bin_ = self._part(axis, index, region, time)
         factor = TileRegion(0, values.shape[0], 0, values.shape[1]).binning()
         tile = self._meant(bin_mean(values, (factor, factor)))
-        return VolumeTile(tile, shown, factor * bin_, 1.0 if axis == 0 else self._at(time).ready)
+        return VolumeTile(tile, shown, factor * bin_, 1.0 if axis == 0 else self._volume_at(time).ready)
 
     def histogram(self, time: int = 0) -> dict[str, list[float]]:
         """Centres of 256 bins over the values, and the number of voxels in each bin (of a sample, if there are many
@@ -282,25 +282,25 @@ class ShownVolume:
         down, across = (step for i, step in enumerate(self._grid.spacing) if i != axis)
         n = int(np.clip(math.ceil(max(abs(r1 - r0), abs(c1 - c0))), 1, 10_000)) + 1
         rows, cols = np.linspace(r0, r1, n), np.linspace(c0, c1, n)
-        at = ((rows - shown.first_row) / bin_ - 0.5, (cols - shown.first_col) / bin_ - 0.5)
-        sampled = map_coordinates(self._meant(values), at, order=1, mode="nearest")
+        positions = ((rows - shown.first_row) / bin_ - 0.5, (cols - shown.first_col) / bin_ - 0.5)
+        sampled = map_coordinates(self._meant(values), positions, order=1, mode="nearest")
         length = math.hypot((r1 - r0) * down, (c1 - c0) * across)
         return {"distance": np.linspace(0, length, n).tolist(), "values": np.nan_to_num(sampled).tolist()}
 
     def _numbers(self, name: str) -> list[float]:
         return list(np.asarray(self._parameters.get(name, ()), np.float64).tolist())
 
-    def _at(self, time: int) -> ScaledSlices | CopiedSlices:
+    def _volume_at(self, time: int) -> ScaledSlices | CopiedSlices:
         """The volume at one of the times. A volume that is not a time series is the same at all times."""
         return self._slices[min(time, len(self._slices) - 1)]
 
     def _part(self, axis: int, index: int, region: TileRegion, time: int) -> tuple[NDArray[Any], TileRegion, int]:
         if not (0 <= axis < 3 and 0 <= index < self.shape[axis]):
             raise DataError(f"Slice {index} across axis {axis} is outside the volume of {self.shape}.")
-        return self._at(time).part(axis, index, region)
+        return self._volume_at(time).part(axis, index, region)
 
     def _sample(self, time: int) -> F32:
-        values = self._meant(self._at(time).sample())
+        values = self._meant(self._volume_at(time).sample())
         return values[np.isfinite(values)]
 
     def _meant(self, values: NDArray[Any]) -> F32:

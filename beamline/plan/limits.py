@@ -42,7 +42,7 @@ class Flight:
     interval: int  # whole counts between neighbouring pulses of a pass (positive)
     step: int  # whole counts between neighbouring angles of all passes together
     exact: float  # the step without rounding
-    drift: float  # largest shift of a view by the rounding, radians
+    drift: float  # largest shift of a projection by the rounding, in radians
 
     def counts(self) -> NDArray[np.int64]:
         """The count of every pulse, in the order of the projections."""
@@ -91,8 +91,7 @@ def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) 
 
 
 def _lattice(angles: NDArray[np.float64], count: float) -> tuple[NDArray[np.int64], float]:
-    """Index of each angle on the lattice from the smallest to the largest angle, and the step of the lattice in
-    radians."""
+    """Index of each angle on the lattice, counted from the smallest angle, and the step of the lattice in radians."""
     low, high = float(angles.min()), float(angles.max())
     step = (high - low) / (angles.size - 1)
     if step > 0:
@@ -111,12 +110,12 @@ def _runs(counts: NDArray[np.int64]) -> list[TriggerTrain]:
     """The longest runs of equal differences, one after the other. A single count is a run of length one."""
     steps = np.diff(counts)
     ends = [*(1 + np.flatnonzero(np.diff(steps))).tolist(), steps.size]  # last count of each stretch of equal steps
-    runs, at = list[TriggerTrain](), 0
-    while at < counts.size - 1:
-        end = ends[bisect(ends, at)]
-        runs.append(TriggerTrain(int(counts[at]), int(steps[at]), end - at + 1))
-        at = end + 1
-    return [*runs, TriggerTrain(int(counts[at]), 0, 1)] if at < counts.size else runs
+    runs, first = list[TriggerTrain](), 0
+    while first < counts.size - 1:
+        end = ends[bisect(ends, first)]
+        runs.append(TriggerTrain(int(counts[first]), int(steps[first]), end - first + 1))
+        first = end + 1
+    return [*runs, TriggerTrain(int(counts[first]), 0, 1)] if first < counts.size else runs
 
 
 MOST_PASSES = 100
@@ -298,11 +297,11 @@ def _ways_within(facts: PlanFacts) -> Iterator[str]:
     """Ways to keep the stage within its limits: another start, a smaller range, or a shorter run-up with a longer
     period."""
     (low, high), stage, views = facts.reach, facts.stage, facts.views
-    down, up = stage.low - low, stage.high - high  # by which all angles may be shifted
+    down, up = stage.low - low, stage.high - high  # the shift of all angles
     if down <= up:
         start = math.degrees(float(facts.plan.angles[0]) + (down if down > 0 else up))
         yield f"begin at {start:.6g} degrees (scan.angles.start_deg)"
-    step, room = views.speed * views.period, views.taxi + min(-down, up)  # room for the run-up
+    step, room = views.speed * views.period, views.taxi + min(-down, up)  # space for the run-up
     if views.taxi and room > 2 * step:
         yield f"set scan.period_s >= {rounded(step / math.sqrt(2 * stage.acceleration * (room - 2 * step)), up=True):g}"
     yield "use a smaller range in scan.angles"

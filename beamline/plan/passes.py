@@ -15,14 +15,15 @@ class Choice(StrEnum):
     """A choice of what is measured next."""
 
     NEXT = "next"  # the next pass of the plan
-    AGAIN = "again"  # the angles of the last pass once more, in place of the last pass that is still to come
-    OFFSET = "offset"  # the offset views of the plan, now
-    RETAKE = "retake"  # views that were flagged, or gave no frame, now
-    ENOUGH = "enough"  # no further pass; offset views of the plan still come, as they set the density
+    AGAIN = "again"  # the angles of the last pass once more, in place of the last pass of the plan
+    OFFSET = "offset"  # the laterally offset projections of the plan, now
+    RETAKE = "retake"  # projections that were flagged or gave no frame, now
+    # no further pass; the laterally offset projections of the plan are still taken, because they determine the density
+    ENOUGH = "enough"
 
     @classmethod
     def _missing_(cls, value: object) -> Choice | None:
-        """Files of earlier versions call the offset projections `wide`."""
+        """Name of the offset projections in files of earlier versions: `wide`."""
         return cls.OFFSET if value == "wide" else None
 
 
@@ -79,12 +80,12 @@ def ended_by(decisions: Iterable[Mapping[str, Any]]) -> str:
         decisions: values of the events `next_chosen`, oldest first.
     """
     last = next((each for each in decisions if each.get("choice") == Choice.ENOUGH), {})
-    after, by, why, left = (last.get(name) for name in ("passes", "by", "reason", "dropped"))
+    after, by, why, dropped = (last.get(name) for name in ("passes", "by", "reason", "dropped"))
     chosen = f" by the {by}" if by else ""
     chosen += (
         f": {why}".rstrip(".") if why and by != "operator" else ""
     )  # if the operator decided, the reason only repeats this
-    rest = f" {left} planned frames were not taken." if left else ""
+    rest = f" {dropped} planned frames were not taken." if dropped else ""
     return (
         f"The scan ended after pass {after or last.get('number')}, because `enough` was chosen{chosen}.{rest}"
         if last

@@ -123,7 +123,10 @@ def _parts(plan: ScanPlan, blocks: Sequence[Block], stage: StageLimits, camera: 
     *starts, end = _stands(blocks)
     placed = zip(blocks, starts, strict=True)
     return summed(
-        *((block.kind.name.lower(), block_seconds(block, stage, camera, plan.settle, at)) for block, at in placed),
+        *(
+            (block.kind.name.lower(), block_seconds(block, stage, camera, plan.settle, angle))
+            for block, angle in placed
+        ),
         ("return", move_seconds(end, stage.max_speed, stage.acceleration)),
         ("warm_up", plan.warm_up * _openings(blocks)),
     )
@@ -198,18 +201,18 @@ def block_seconds(block: Block, stage: StageLimits, camera: CameraTiming, settle
     tail = block.exposure + camera.readout
     if block.mode is Mode.STATIC or (block.mode is Mode.FLY and not block.trains):
         return (block.n - 1) * block.period + tail
-    seconds, at = 0.0, start
+    seconds, position = 0.0, start
     if block.mode is Mode.FLY:
         for flown in passes(block):
-            seconds += move_seconds(flown.start - at, stage.max_speed, stage.acceleration)
+            seconds += move_seconds(flown.start - position, stage.max_speed, stage.acceleration)
             seconds += move_seconds(flown.end - flown.start, block.speed, stage.acceleration)
-            at = flown.end
+            position = flown.end
         return seconds + tail
     for i, angle in enumerate(np.delete(block.angles, list(block.stored)).tolist()):
-        stands = bool(i) and angle == at
-        ready = 0.0 if stands else move_seconds(angle - at, stage.max_speed, stage.acceleration) + settle
+        stands = bool(i) and angle == position
+        ready = 0.0 if stands else move_seconds(angle - position, stage.max_speed, stage.acceleration) + settle
         seconds += max(block.period, camera.min_period, tail + ready) if i else ready
-        at = angle
+        position = angle
     return seconds + tail
 
 
@@ -291,7 +294,7 @@ def _end(block: Block) -> float:
 def _stands(blocks: Iterable[Block]) -> list[float]:
     """Angles of the stage before each block, and after the last block."""
     moving = (block if block.n_to_take and block.mode is not Mode.STATIC else None for block in blocks)
-    return [*accumulate(moving, lambda at, block: at if block is None else _end(block), initial=0.0)]
+    return [*accumulate(moving, lambda angle, block: angle if block is None else _end(block), initial=0.0)]
 
 
 def describe(
@@ -301,10 +304,10 @@ def describe(
     lines = [
         f"{'rows':>13}  {'what':<10}  {'frames':>6}  {'how':<6}  {'exposure':>9}  {'period':>9}  {'time':>9}  angles"
     ]
-    for block, row, at in zip(timeline.blocks, timeline.first_rows, _stands(timeline.blocks), strict=False):
+    for block, row, angle in zip(timeline.blocks, timeline.first_rows, _stands(timeline.blocks), strict=False):
         if not block.n_to_take:
             continue
-        seconds = block_seconds(block, stage, camera, plan.settle, at)
+        seconds = block_seconds(block, stage, camera, plan.settle, angle)
         lines.append(
             f"{row:>6}-{row + block.n_to_take - 1:<6}  {block.kind.name.lower():<10}  {block.n_to_take:>6}  "
             f"{block.mode:<6}  {block.exposure:>7.4g} s  {block.period:>7.4g} s  {seconds:>7.1f} s  "

@@ -25,14 +25,15 @@ from recon.prep.axis_ends import ENDS
 from recon.prep.axis_wedge import AGREE
 from recon.prep.projections import Projections
 
-_AXIS_VIEWS = 360  # more projections do not make the axis more accurate, they only take time to read
+_AXIS_VIEWS = 360  # most projections that are used: more do not make the axis more accurate, and take time to read
 _AXIS_ROWS = 64
-# projections that are enough to check an axis that is given. With fewer, the result may look certain and be wrong
+# fewest projections with which a given axis is checked. With fewer, the result may look certain and be wrong.
 _COMPARED, _FEWEST = 90, 20
-# columns of binned projections: an axis is confirmed if the held-out projections find it within this distance
+# columns of binned projections: an axis is confirmed if held-out projections find it within this distance
 _CONFIRMED = 0.5
-_CANDIDATES = 14  # candidates for the axis of a cone beam, the usual number
-# share of the total absorption in replaced pixels. It shifts the centre of mass by at most 1 % of half the width
+_CANDIDATES = 14  # usual number of candidates for the axis of a cone beam
+# largest share of the total absorption in replaced pixels; it shifts the centre of mass by at most 1 % of half the
+# width
 _GUESSED = 0.01
 
 
@@ -41,7 +42,7 @@ class LocatedAxis:
     """The rotation axis found in a band of rows.
 
     Attributes:
-        col: in columns of the full detector.
+        col: column of the axis on the full detector.
         warning: what to check if there is no clear optimum; empty if there is one.
     """
 
@@ -63,7 +64,7 @@ def rotation_axis(
 
     Raises:
         DataError: no axis explains the projections.
-        ConfigError: it lies outside the detector.
+        ConfigError: the axis lies outside the detector.
     """
     if poses is not None and poses.vectors is not None:
         return poses.axis_col, None
@@ -84,7 +85,7 @@ def rotation_axis(
 
 
 def _compare_with_views(given: float, plan: ScanCorrectionPlan, frames: NDArray[np.int64], warn: Warn) -> None:
-    """Warn if some of the projections clearly show another axis than the one that was given."""
+    """Warn if some projections clearly show another axis than the axis that the user gave."""
     with suppress(DataError):
         some = spread(frames, _COMPARED)
         shown = locate_axis(plan, some, all_there=False)
@@ -104,7 +105,9 @@ def _axis_by_views(
     warn: Warn,
     progress: Callable[[int, int], None],
 ) -> tuple[float, AxisEstimate | None]:
-    """The axis found with held-out projections. The file's axis is kept unless they agree better with another one."""
+    """The axis found with held-out projections. The axis of the file is kept unless the held-out projections agree
+    better with another axis.
+    """
     source, stated, cols = scan.source, scan.source.axis_col, scan.source.shape[1]
     if scan.selection.axis_rows is not None:
         scan = scan.part(rows=scan.selection.axis_rows)
@@ -181,8 +184,8 @@ def locate_axis(
     """Find the rotation axis from a band of rows of projections spread over `frames`; `warn` as in `apply`.
 
     If the estimate has no clear optimum, the axis stated in the file is used. If the file states none and the
-    projections are `all_there`, held-out projections find the axis. They would mislead if only a part of the turn
-    was measured, or 180 degrees of a sample wider than the field of view.
+    projections are `all_there`, held-out projections find the axis. Held-out projections would mislead if only a part
+    of the rotation was measured, or only 180 degrees of a sample wider than the field of view.
 
     Raises:
         DataError: no axis in the search range explains the projections.
@@ -191,7 +194,7 @@ def locate_axis(
     start, source = max(0, (height - _AXIS_ROWS) // 2), plan.source
     frames = spread_views(source.table.angles[frames], _AXIS_VIEWS, frames)
     band = apply(plan, frames, slice(start, min(height, start + _AXIS_ROWS)), warn, progress)
-    # columns behind slits, which were replaced; noise there has a large effect on the axis
+    # columns behind slits that were replaced; their noise would strongly affect the axis
     hidden = band.masked.all(axis=0)
     lit = np.flatnonzero(~hidden | hidden.all())
     angles = source.table.angles[band.view_ids]
@@ -219,21 +222,21 @@ def locate_axis(
 
 
 def _hides_matter(band: Projections) -> bool:
-    """True if parts of rows without data in a projection were filled with sample material, whose place is a guess."""
+    """True if parts of rows without data were filled with sample material. The position of this material is a guess."""
     if not band.unmeasured.size or (lit := band.lit) is None:
         return False
     return bool(band.data[~lit & lit.any(axis=2, keepdims=True)].sum() > _GUESSED * band.data.sum())
 
 
 def _by_unseen_views(band: Projections, angles: NDArray[np.float64]) -> AxisEstimate | None:
-    """The axis of a sample wider than the field of view, or of a detector partly without beam; None: not found this
-    way either.
+    """The axis if the sample is wider than the field of view, or if a part of the detector has no beam. None: the axis
+    was not found.
 
-    A part without beam makes the axis uncertain by half a column, and by more if the sample also leaves the field of
-    projection.
+    If a part of the detector has no beam, the axis is uncertain by half a column, and by more if the sample also
+    extends beyond the field of view.
     """
     if band.data.shape[1] < band.data.shape[2] // COLS:
-        return None  # columns would not be binned, and volumes would take minutes
+        return None  # otherwise columns would not be binned, and volumes would take minutes
     dark, some, lit = areas(band.masked), spread(np.arange(angles.size), VIEWS), band.lit
     data = np.ascontiguousarray(band.data[some])
     with suppress(ValueError):
@@ -249,7 +252,7 @@ def stated_axis(source: ScanSource) -> float:
     """The rotation axis stated by the file of a cone-beam scan that is still running.
 
     Raises:
-        DataError: the file states none.
+        DataError: the file does not state the axis.
     """
     if source.axis_col is None:
         raise DataError(

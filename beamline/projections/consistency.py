@@ -1,5 +1,5 @@
-"""Consistency: conditions that all projections of a sample at rest must meet, and whether their intensity matches
-the flats.
+"""Consistency: checks conditions that all projections of a sample at rest must meet, and whether the intensity of the
+projections matches the flats.
 """
 
 from __future__ import annotations
@@ -32,57 +32,59 @@ from recon.prep.tilt import roll_of_mean_view
 from recon.voxels.beyond_field import reach_of
 from recon.voxels.view_weights import circle_weights, covers_the_circle
 
-_VIEWS = 180  # projections used for the moments; more do not make them more accurate, they only take time to read
+_VIEWS = 180  # projections used for the moments: more do not make the moments more accurate, and take time to read
 _COLUMN_VIEWS = 32  # projections whose columns are examined
 _LEAST_VIEWS, _LEAST_ROWS = 12, 8  # with fewer rows, the disagreement between rows cannot be estimated
 _HALF_A_PIXEL = 0.5  # a larger shift doubles edges visibly; the same limit as of the monitor's check `opposite`
-# percentiles over the projections: a single projection with a particle in front of the sample does not count
+# percentiles over the projections, so that a single projection with a particle in front of the sample does not count
 _MOST_OF_THEM = 5, 95
-_NOISE = 3.3  # distance of these percentiles in standard deviations, if there is only noise
-_ACROSS = 1.0  # columns. A teapot with 12 % beam hardening has 0.7, a measured tooth 0.5
+_NOISE = 3.3  # distance of these percentiles, in standard deviations, if there is only noise
+_ACROSS = 1.0  # columns: a teapot with 12 % beam hardening has 0.7, a measured tooth 0.5
 _STEP_OF_LIGHT = 0.1  # line integral; the same limit as of the monitor's alarm `gain`
-_OF_LOCAL = 3.0  # times the change to the next projection, because opposite angles may differ by up to one step
-# radians. With steps this small, even a slab 20 times as long as thick and wider than the field makes no single
+_OF_LOCAL = 3.0  # factor on the change to the next projection, because opposite angles may differ by up to one step
+# radians: with steps this small, even a slab 20 times as long as thick and wider than the field of view has no single
 # outlier
 _BESIDE = np.radians(4.1)
-# share of the total absorption (as the monitor's `mass`); standard deviations of most projections
+# share of the total absorption (as for the monitor's check `mass`); standard deviations of most projections
 _MASS, _OUTLIERS = 0.03, 6.0
-# share between these percentiles of the projections: Diamond 24737 has 0.011, a tooth 0.019
+# share between these percentiles over the projections: Diamond 24737 has 0.011, a tooth 0.019
 _MASSES, _TENTHS = 0.06, (10, 90)
-_FEW = 0.2  # share of the projections up to which outliers are named one by one, however large they are
+_FEW = 0.2  # up to this share of the projections, outliers are named one by one, however large they are
 # relative error of the angular range. A thorax with 12 % hardening has 0.011, measured scans up to 0.009, 60 other
 # scans at rest less
 _STRETCH = 0.015
 # In steps: how close the measured range must be to the other way of counting the ends of a 180° or 360° scan (with or
 # without both ends, a step apart). Found in 31 of 40 scans with this error, and in none of 232 without it.
 _OF_A_STEP = 1 / 3
-_BESIDE_ROW = 8  # rows above and below the plane of the source that count as in the plane
-# times the least disagreement; the least disagreement as a share of the variance; degrees
+_BESIDE_ROW = 8  # number of rows above and below the plane of the source that count as lying in the plane
+# factor on the least disagreement; least disagreement as a share of the variance; degrees
 _OFTEN, _AGREE, _FAN = 1.3, 0.01, 2.5
-# The same for a fan that is the right one if SDD was stated from the axis; radians from that fan
+# the same for the fan that is right if SDD was stated from the axis; radians from that fan
 _OFTEN_BY_AXIS, _SAME_FAN = 1.15, 0.01
 # columns between the axis found from the moments and the axis used; beyond that, angles are not checked
 _SAME_AXIS = 1.0
-_FAINT = 0.3  # line integral. In fainter samples, the error that the air may have at an edge is a large part
-# share of pixels below the smallest transmission, whose line integrals are too small; another warning reports them
+_FAINT = 0.3  # line integral: in fainter samples, an error of the air at an edge is a large part
+# share of pixels below the smallest transmission; their line integrals are too small, which another warning reports
 _FLOORED = 1e-3
-# share of the largest line integral; an edge may have that much although the sample is inside the field of view
+# share of the largest line integral: an edge may have this much although the sample is inside the field of view
 _AIR = 0.1
 _SURE = 4.0  # standard deviations
-# Least changes that are reported: rows, shares of absorption, width, height; 369 scans at rest reach 5.2 sigmas.
+# smallest changes that are reported: rows, shares of absorption, width, height; 369 scans at rest reach 5.2 standard
+# deviations
 _REPEATED, _REPEATED_SIGMAS = np.array([0.5, 0.06, 0.025, 0.03]), 6.0
-_SCALED = ". A pixel size that differs between the projections has the same effect"  # in width and height alike
+# a change of the width and of the height by the same factor
+_SCALED = ". A pixel size that differs between the projections has the same effect"
 _COMPARED = ("higher", "lower"), ("less absorbing", "more absorbing"), ("narrower", "wider"), ("shorter", "taller")
 
 
 @dataclass(frozen=True)
 class ConsistencyCondition:
-    """A condition that all projections of a sample at rest must meet, and by how much they violate it.
+    """A condition that all projections of a sample at rest must meet, and by how much the projections violate it.
 
     Attributes:
         residual: by how much the condition is violated, in `unit`.
-        tolerance: larger residuals are reported. Hardening, phase, scatter and noise cause smaller ones in scans at
-            rest.
+        tolerance: larger residuals are reported. In scans of a sample at rest, hardening, phase, scatter and noise
+            cause smaller residuals.
         sentence: what was found, where, and what to do.
     """
 
@@ -101,18 +103,19 @@ class ConsistencyCondition:
 
 
 def warn_of_inconsistency(prepared: PreparedProjections, selection: ScanSelection, warn: Warn) -> dict[str, str]:
-    """Warn of consistency conditions that the projections violate; returns the residual of each in words, by name.
+    """Warn of consistency conditions that the projections violate. Returns the residual of each condition in words, by
+    name.
 
     In a parallel beam, with the sample inside the field of view, moments of the projections check angles, heights,
     turned frames, total absorption and the rotation axis. In other scans, projections of the same rays are compared.
-    The moments are not checked if only a part of the rows is used: in scan 24737 of Diamond, the rows above the metal
-    indicate a range of angles that is 14 % too large, for an unknown reason. Projections that measured only a part of
-    their pixels are left out.
+    The moments are not checked if only a part of the rows is used. (In scan 24737 of Diamond, the rows above the metal
+    indicate a range of angles that is 14 % too large, for an unknown reason.) Projections in which some pixels have no
+    data are left out.
     """
     if 0 < (whole := prepared.whole_views).size < prepared.geometry.n_views:
         prepared = prepared.of_views(whole)
     geometry = prepared.geometry
-    known = prepared.measured is None and prepared.corrected.floored <= _FLOORED
+    known = prepared.sources.measured is None and prepared.corrected.floored <= _FLOORED
     if geometry.shifts.any() or not geometry.is_straight or whole.size < _LEAST_VIEWS or not known:
         return {}
     conditions = _conditions_of(prepared, whole=selection.asked.rows is None)
@@ -163,11 +166,11 @@ def _conditions_within_the_field(prepared: PreparedProjections, some: NDArray[np
 def compare_with_flats(
     scan: SelectedScan, projections: Projections, warn: Warn, *, refused: bool = True
 ) -> dict[str, str]:
-    """Warn of projections whose intensity does not match their flats. Returns in words how bright their air is
-    relative to the flats.
+    """Warn if the intensity of projections does not match their flats. Returns in words how bright the air is relative
+    to the flats.
 
     Args:
-        refused: a difference that no beam has is an error.
+        refused: True: a difference that is too large for any beam is an error.
 
     Raises:
         DataError: the difference is larger than any beam's, and the flats and darks are checked.
@@ -175,7 +178,7 @@ def compare_with_flats(
     evidence = scan.evidence
     if evidence.beam is None or not len(projections.data):
         return {}
-    said = scan.selection.step(Air).model != "auto"  # the user states which columns are air
+    stated_by_user = scan.selection.step(Air).model != "auto"  # the user states which columns are air
     if any(projections.air_columns):
         level = -float(np.log(np.median(projections.air)))
     else:
@@ -185,20 +188,19 @@ def compare_with_flats(
         ]
         level = float(np.median(columns, axis=0).min())
     air = any(projections.air_columns)
-    for finding in check_air_level(evidence, level, air, evidence.asked.accepted or said or not refused):
+    for finding in check_air_level(evidence, level, air, evidence.asked.accepted or stated_by_user or not refused):
         refuse(scan.source, [finding])
         warn(finding.message)
     return {"air beside the flats": f"{level:+.3f} in line integral (tolerance {WARN:g})"} if air else {}
 
 
 def _faint_or_off(data: F32, some: NDArray[np.intp]) -> tuple[float, bool]:
-    """Two facts about the edges: how weakly the sample absorbs, and whether the air is far from zero.
+    """Two facts from the edges: how weakly the sample absorbs, and whether the air is far from zero.
 
     Returns:
-        Faintness. Above 1, material that leaves the field of view may go unnoticed, because it is corrected as air;
-        the moments are not valid then.
-        True if the edges are far from 0, for example if the beam drifts and --air does not correct it: such air
-        contributes to the moments.
+        Two values. (1) The faintness. If it is above 1, material that extends beyond the field of view may go
+        unnoticed, because it is corrected as air; the moments are then not valid. (2) True if the edges are far from 0,
+        for example because the beam drifts and --air does not correct it. Air then contributes to the moments.
     """
     edges = np.abs([np.median(data[view][:, [0, -1]]) for view in some])
     deepest = float(np.median([data[view].max() for view in some]))
@@ -227,7 +229,7 @@ def _noise_of(prepared: PreparedProjections, views: Sequence[F32]) -> tuple[floa
 def _steady(
     data: F32, some: NDArray[np.intp], angles: F64, axis_col: float, frames: NDArray[np.int64]
 ) -> ConsistencyCondition:
-    """Projections 180° apart must be mirror images; used if no air shows the intensity."""
+    """Projections that are 180° apart must be mirror images. This condition is used if no air shows the intensity."""
     reach = int(min(axis_col, data.shape[2] - 1 - axis_col))
     around = slice(round(axis_col) - reach, round(axis_col) + reach + 1)
     levels = np.array([np.median(data[view][:, around]) for view in some])
@@ -242,10 +244,10 @@ def _steady(
         f"Frames {min(frames[[first, last]])} and {max(frames[[first, last]])}, 180° apart, must be mirror "
         f"images, but they differ by {abs(levels[first] - levels[last]):.2f} in line integral"
     )
-    at, odd = _out_of_line(levels, angles)
+    outlier, odd = _out_of_line(levels, angles)
     if odd > max(_STEP_OF_LIGHT, np.nan_to_num(size)):
         size, more = odd, f"{odd:.2f} in line integral more than these differ from each other"
-        what = f"The intensity of the whole frame {frames[at]} differs from its neighbours in angle, by {more}"
+        what = f"The intensity of the whole frame {frames[outlier]} differs from its neighbours in angle, by {more}"
     sentence = (
         f"{what}, and there is no air next to the sample to correct this. Intensity, exposure, energy or "
         "filter changed, or projections of another scan are among them. Use --views to choose "
@@ -255,8 +257,8 @@ def _steady(
 
 
 def _out_of_line(levels: F64, angles: F64) -> tuple[int, float]:
-    """The projection that differs most from its neighbours in angle, and by how much more than the neighbours
-    differ.
+    """The projection that differs most from its neighbours in angle, and by how much more than its neighbours differ
+    from theirs.
     """
     order = np.argsort(angles, kind="stable")
     steps = np.diff(levels[order])
@@ -269,8 +271,8 @@ def _out_of_line(levels: F64, angles: F64) -> tuple[int, float]:
 
 
 def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: float) -> ConsistencyCondition:
-    """The total absorption must be the same in all projections, except for hardening along the longer side of a
-    sample, which varies twice a turn.
+    """The total absorption must be the same in all projections, except for beam hardening along the longer side of a
+    sample, which varies twice per turn.
     """
     parts = np.column_stack([np.ones_like(angles), np.cos(2 * angles), np.sin(2 * angles)])
     rest = shown.mass - parts @ np.linalg.lstsq(parts, shown.mass, rcond=None)[0]
@@ -324,7 +326,7 @@ def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCo
     stated = pitch / geometry.sdd if geometry.is_cone else 0.0
     sinogram = data[some][:, rows].mean(axis=1, dtype=np.float64)
     off, least, usual, best = fans_shown(sinogram, geometry.angles[some], geometry.axis_col, stated)
-    told, shown = (2 * math.degrees(math.atan(slope * across)) for slope in (stated, best))
+    stated_angle, best_angle = (2 * math.degrees(math.atan(slope * across)) for slope in (stated, best))
     away = f" ({pitch / best:.3g} mm from source to detector)" if geometry.is_cone and best > 0 else ""
     check = (
         "Check --cone SOD:SDD: both are in mm, and SDD is the distance from the source to the detector, "
@@ -334,15 +336,15 @@ def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCo
     )
     sentence = (
         f"{check} The projections contradict the stated geometry. A 360° scan measures each ray twice, from opposite "
-        f"sides. The two values agree best if the fan angle is {shown:.3g} degrees{away}, but it is {told:.3g} "
-        "degrees with the stated distances."
+        f"sides. The two values agree best if the fan angle is {best_angle:.3g} degrees{away}, but it is "
+        f"{stated_angle:.3g} degrees with the stated distances."
     )
     by_axis = pitch / (geometry.sdd + geometry.sod) if geometry.is_cone else np.inf  # SDD stated from the axis
     is_by_axis = abs(math.atan(best * across) - math.atan(by_axis * across)) <= _SAME_FAN
     often = _OFTEN_BY_AXIS if is_by_axis else _OFTEN
-    sure = off > often * least and least < min(_AGREE, usual / 2)  # a round sample agrees for every fan
+    sure = off > often * least and least < min(_AGREE, usual / 2)  # a round sample agrees with every fan
     return ConsistencyCondition(
-        "rays from both sides", abs(shown - told) if sure else np.nan, _FAN, "degrees of fan", sentence
+        "rays from both sides", abs(best_angle - stated_angle) if sure else np.nan, _FAN, "degrees of fan", sentence
     )
 
 
@@ -388,11 +390,11 @@ def _angles(shown: ViewMoments, angles: NDArray[np.floating]) -> ConsistencyCond
 
 
 def _ends_of_turn(data: F32, geometry: Geometry, stretch: float) -> str:
-    """A sentence if the ends of a 180° or 360° scan are counted wrongly: the stated angles include both ends and the
-    projections do not, or the reverse.
+    """A sentence if the ends of a 180° or 360° scan are counted wrongly: either the stated angles include both ends and
+    the projections do not, or the reverse.
 
-    It is found from the first and the last projection, and from the difference between the measured and the stated
-    range.
+    The error is found from the first and the last projection, and from the difference between the measured and the
+    stated range of angles.
     """
     order = np.argsort(geometry.angles, kind="stable")
     (first, second, *_, late, last), span = order, float(np.ptp(geometry.angles))
@@ -406,7 +408,8 @@ def _ends_of_turn(data: F32, geometry: Geometry, stretch: float) -> str:
     again = np.stack([np.interp(places, cols, row) for row in data[last]])
     change = float(np.square(again - data[first]).mean())
     of_step = (np.square(data[second] - data[first]).mean() + np.square(data[last] - data[late]).mean()) / 2
-    alike = change < of_step / 2  # 0 and noise where they are of one ray, 1 where they are a step apart
+    # the difference is 0 plus noise if both see the same ray, and 1 if they are a step apart
+    alike = change < of_step / 2
     if alike == closed or not abs(stretch * order.size + (1 if closed else -1)) < _OF_A_STEP:
         return ""
     what = "directions one step apart" if closed else "the same rays"

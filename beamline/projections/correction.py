@@ -1,4 +1,6 @@
-"""Correction of a scan's frames: `survey` makes the plan, `apply` converts frames to line integrals with it."""
+"""Corrects the frames of a scan: `survey` makes a plan, and `apply` uses the plan to convert frames to line
+integrals.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,7 @@ from recon.prep.lines_plan import LinesPlan
 from recon.prep.projections import Projections, merge_and_empty
 from recon.prep.references import References
 
-_COPIES = 3  # float32 copies of the projections that are corrected at once
+_COPIES = 3  # number of float32 copies of the projections that are corrected together
 _STEPS = 3  # steps per frame in the progress: reading, dividing by the flat, removing zingers
 NO_VIEWS = np.empty(0, np.int64)
 Done = Callable[[int, int], None]  # (n, N): n of N frames are done
@@ -59,13 +61,13 @@ class ScanCorrectionPlan:
 
     Attributes:
         filters: filters of projections, with the rows and the binning.
-        settings: of the conversion of counts.
-        references: darks and flats of the rows that are read, binned; None: the frames are line integrals already.
+        settings: settings of the conversion of counts.
+        references: darks and flats of the rows that are read, binned; None: the frames are already line integrals.
         photons: how pixels count photons; None: logarithms are taken.
-        light: float64 [frame], factor to the usual exposure and, if asked for, to the median ring current; None: 1
-            for all.
+        light: float64 [frame], factor that scales the frame to the usual exposure and, on request, to the median ring
+            current; None: 1 for all.
         shadow: objects in the beam of all projections; None: not searched for, or too few projections.
-        beam_done: what was done about flats, defects and noise, by these names.
+        beam_done: what was done about flats, defects and noise, as texts by name.
         warnings: sentences on damaged references, on zingers in them, and on parts of the scan without flats.
     """
 
@@ -80,7 +82,7 @@ class ScanCorrectionPlan:
 
     @property
     def scan(self) -> SelectedScan:
-        """The scan, as it was when the plan was made, with the rows, the binning and the steps."""
+        """The scan at the time when the plan was made, with its rows, binning and steps."""
         return self.filters.scan
 
     @property
@@ -95,7 +97,7 @@ class ScanCorrectionPlan:
         return {asked.name: asked.done, **self.beam_done, **self.filters.done}
 
     def of_rows(self, rows: slice | None) -> Plan:
-        """The plan of some binned rows, with the margin that filters need; of all rows for None.
+        """The plan for some binned rows, with the margin that filters need. None: for all rows.
 
         Raises:
             ValueError: references that cannot be used.
@@ -120,12 +122,13 @@ def survey(scan: SelectedScan, views: NDArray[np.int64] = NO_VIEWS) -> ScanCorre
     Groups of references with a fault are used only if no other group is left.
 
     Args:
-        views: rows of the file: usable projections, in which objects that stand in the beam of all are searched for;
-            empty: no search.
+        views: rows of the usable projections. In them, objects that stand in the beam of all projections are searched
+            for; empty: no search.
 
     Raises:
-        ConfigError: rows or binning that do not fit the detector; counted photons of a scan without counts, or
-            without the counts of a photon; too few flats for dynamic ones; or no ring current.
+        ConfigError: rows or binning do not fit the detector; photon counting was requested, but the scan has no counts
+            or the counts per photon are unknown; there are too few flats for dynamic flats; or the ring current is
+            missing.
         DataError: references that cannot be used.
     """
     source, settings = scan.source, CorrectionSettings()
@@ -134,7 +137,7 @@ def survey(scan: SelectedScan, views: NDArray[np.int64] = NO_VIEWS) -> ScanCorre
     altered = (altered_sentence(source),) if source.table.altered.any() else ()
     plan = ScanCorrectionPlan(ViewFilters.of(scan), settings, warnings=altered)
     asked = scan.selection.step(Preparation)
-    if plan.filters.filters:  # they mix pixels, whose counts then have no known likelihood
+    if plan.filters.filters:  # these steps mix pixels, so the likelihood of the counts is no longer known
         asked = replace(asked, noise="log", gain=None)
     if source.quantity == "counts":
         plan = _with_references(plan, scan.with_steps(asked))
@@ -146,7 +149,9 @@ def survey(scan: SelectedScan, views: NDArray[np.int64] = NO_VIEWS) -> ScanCorre
 
 
 def _with_references(plan: ScanCorrectionPlan, scan: SelectedScan) -> ScanCorrectionPlan:
-    """The plan with the darks and flats in the file, and what they show of the beam; `scan` with the noise model."""
+    """The plan with the darks and flats in the file, and the facts about the beam that they show. `scan` has the noise
+    model.
+    """
     read, asked, evidence = plan.filters.read(None), scan.selection.step(Preparation), scan.evidence
     light = light_scale(evidence, asked.by_current) if asked.by_current or evidence.views_differ else None
     references, note = read_references(scan, read)
@@ -156,7 +161,7 @@ def _with_references(plan: ScanCorrectionPlan, scan: SelectedScan) -> ScanCorrec
     photons = photons_of(scan, references)
     flats, noise = flats_sentence(evidence, references, asked.by_current), noise_sentence(references, photons)
     recorded = {name: each if isinstance(each, float) else str(each) for name, each in asdict(plan.settings).items()}
-    del recorded["sample_from"]  # follows from --air
+    del recorded["sample_from"]  # the line follows from --air
     done = {
         "defects": StepDone(parameters={f"correction_{name}": value for name, value in recorded.items()}),
         "flats": StepDone(flats, {"flats": flats or asked.flat_fields}),
@@ -182,7 +187,8 @@ def in_shadow(plan: ScanCorrectionPlan, views: NDArray[np.int64]) -> ScanCorrect
 def with_filters_of(plan: ScanCorrectionPlan, scan: SelectedScan, views: NDArray[np.int64]) -> ScanCorrectionPlan:
     """The plan with the filters of another selection of the same rows, of the same scan.
 
-    Frames are read again only if the filters need other rows than before, or mix pixels whose photons were counted.
+    Frames are read again in two cases: the filters need other rows than before, or they mix pixels whose photons were
+    counted.
     """
     filters, before = ViewFilters.of(scan), plan.filters
     if filters.read(None) == before.read(None) and (not filters.filters or plan.photons is None):
@@ -213,26 +219,27 @@ def apply(
     warn: Warn | None = None,
     progress: Done = lambda n, total: None,
 ) -> Projections:
-    """Line integrals of `frames` (rows of the file), without projections that have no finite pixel: see `view_ids`.
+    """Line integrals of `frames` (rows of the file). Projections without a finite pixel are left out; `view_ids` lists
+    the others.
 
     Args:
         frames: rows of the file, in the order they were taken.
         rows: narrows the detector rows, in binned rows.
-        warn: function that gets sentences on the frames that are left out, and on copies.
+        warn: function that gets sentences about frames that are left out, and about frames that are copies.
         progress: function that gets the number of frames done and their total number; each frame is read, divided
             by the flat, and cleared of zingers.
 
     Raises:
-        DataError: frames that cannot be corrected; the message names the file.
+        DataError: frames cannot be corrected; the message names the file.
     """
     steps = 1 if plan.references is None else _STEPS
     data, usable = read_usable(plan, frames, rows, warn, lambda n, of: progress(n // steps, of))
     if not (n := usable.size):
         raise no_view(plan.scan.evidence, plan.references)
     with refused(plan):
-        order, at = by_angle(plan.source.table, usable), usable.astype(np.float64)
+        order, positions = by_angle(plan.source.table, usable), usable.astype(np.float64)
         lines, _ = correct.apply(
-            data, at, plan.of_rows(rows), usable, progress=lambda done: progress((n + done) // _STEPS, n),
+            data, positions, plan.of_rows(rows), usable, progress=lambda done: progress((n + done) // _STEPS, n),
             order=order,
         )  # fmt: skip
     return plan.filters.apply(lines, rows)
@@ -242,16 +249,16 @@ def apply_in_batches(
     plan: ScanCorrectionPlan, frames: NDArray[np.int64], out: NDArray[np.float32], batch: int, warn: Warn | None,
     progress: Done,
 ) -> Projections:  # fmt: skip
-    """Line integrals bit-identical to those of `apply`, with at most `batch` frames in memory; a scan in counts is
-    read twice.
+    """Line integrals that are bit-identical to those of `apply`, computed with at most `batch` frames in memory. A scan
+    in counts is read twice.
 
     Args:
-        out: float32 [frame, row, col], at least so many: takes the line integrals.
+        out: float32 [frame, row, col], with room for all frames: receives the line integrals.
         warn: as in `apply`.
-        progress: how many of how many frames were read.
+        progress: function that gets the number of frames read and their total number.
 
     Raises:
-        DataError: as `apply`; photons are counted: their weights would have to be in memory.
+        DataError: as for `apply`; also if photons are counted, because their weights would have to be in memory.
     """
     if plan.photons is not None:
         raise DataError(
@@ -281,12 +288,12 @@ def apply_in_batches(
         warn(sentence)
     if not ids.size:
         raise no_view(plan.scan.evidence, plan.references)
-    for at, place in enumerate(np.searchsorted(in_time, ids)):  # without the projections that are left out
-        if at != place:
-            out[at] = out[place]
+    for row, place in enumerate(np.searchsorted(in_time, ids)):  # without the projections that are left out
+        if row != place:
+            out[row] = out[place]
     masked = np.logical_and.reduce([part.masked for part in kept])
-    found = merge_and_empty(kept, out[: ids.size])
-    return replace(found, masked=masked, view_ids=ids, air=found.air[np.argsort(found.view_ids)])
+    merged = merge_and_empty(kept, out[: ids.size])
+    return replace(merged, masked=masked, view_ids=ids, air=merged.air[np.argsort(merged.view_ids)])
 
 
 def _with_air_found(
@@ -296,7 +303,7 @@ def _with_air_found(
     warn: Warn | None,
     done: Callable[[int], None],
 ) -> tuple[list[NDArray[np.int64]], CorrectionPlan]:
-    """The frames of each part that can be used, and the plan for counts with the air columns of all of them."""
+    """The usable frames of each part, and the plan for counts with the air columns of all parts."""
     usable = []
     for n, part in enumerate(parts, 1):
         data, some = read_views(plan.filters, plan.references, part, None, warn)
@@ -314,11 +321,11 @@ def read_usable(
     warn: Warn | None,
     progress: Done = lambda n, total: None,
 ) -> tuple[NDArray[Any], NDArray[np.int64]]:
-    """Pixels of the frames that can be used, and these frames, see `read_views`; `warn` also gets a sentence on
-    projections without beam.
+    """The usable frames and their pixels, see `read_views`. `warn` also gets a sentence about projections without
+    beam.
     """
     data, usable = read_views(plan.filters, plan.references, frames, rows, warn, progress)
-    # a band of rows does not show whether a projection is usable
+    # a band of rows is not enough to decide whether a projection is usable
     if warn is not None and rows is None and (sentence := unlit_sentence(plan.scan.evidence, frames, usable)):
         warn(sentence)
     return data, usable
@@ -327,7 +334,7 @@ def read_usable(
 def apply_next(
     plan: ScanCorrectionPlan, data: NDArray[Any], frames: NDArray[np.int64], state: Plan, last: bool
 ) -> tuple[Projections | None, Plan]:
-    """Line integrals of the next frames, None if none is ready; and the state for those that follow.
+    """Line integrals of the next frames (None if none are ready), and the state for the frames after them.
 
     Args:
         state: `of_rows(None)` of the plan, after the frames before these.
@@ -339,7 +346,7 @@ def apply_next(
 
 
 def line_integrals_of(scan: SelectedScan, frames: NDArray[np.int64]) -> Projections:
-    """Line integrals of some frames of a finished scan, corrected on their own.
+    """Line integrals of some frames of a finished scan, corrected without the other frames.
 
     Raises:
         ConfigError, DataError: as in `survey` and `apply`.
@@ -354,7 +361,7 @@ def flats_as_projections(plan: ScanCorrectionPlan, most: int) -> NDArray[np.floa
     line integrals already.
 
     Raises:
-        DataError: as `apply`.
+        DataError: as for `apply`.
     """
     if plan.references is None:
         return np.zeros((0, 0, 0), np.float32)
@@ -367,8 +374,8 @@ def flats_as_projections(plan: ScanCorrectionPlan, most: int) -> NDArray[np.floa
 def by_angle(table: FrameTable, frames: NDArray[np.int64]) -> NDArray[np.intp]:
     """The order of frames in which neighbours in angle follow one another.
 
-    It is the order of the scan, unless that skips angles, or the sample is offset in some frames; these are then
-    grouped.
+    It is the order of the scan, except in two cases: the scan skips angles, or the sample is offset in some frames.
+    Offset frames are then grouped.
     """
     angles, places = table.angles[frames], np.zeros(frames.size)
     if table.aside is not None:
@@ -379,7 +386,7 @@ def by_angle(table: FrameTable, frames: NDArray[np.int64]) -> NDArray[np.intp]:
 
 
 def at_once_memory(scan: SelectedScan, frames: int, rows: slice | None = None) -> int:
-    """Memory in bytes that `apply` needs for N frames, including the line integrals; `rows` as there.
+    """Memory in bytes that `apply` needs for N frames, including the line integrals; `rows` is as for `apply`.
 
     Raises:
         ConfigError: the selection does not fit the scan.

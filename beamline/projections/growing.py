@@ -1,4 +1,6 @@
-"""Correction of a scan that grows: frames are fed as they arrive, and each feeding gives the next state."""
+"""Corrects a scan that is still growing: the caller adds frames as they arrive, and each call returns the next
+state.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +27,14 @@ from recon.prep.projections import Projections
 class FedCorrection:
     """The state of the correction of a scan that grows.
 
-    Its line integrals are bit-identical to those of `apply` for all frames, as long as the references and the air
+    The line integrals are bit-identical to those of `apply` for all frames, as long as the references and the air
     columns stay the same; see `outdated`.
 
     Attributes:
-        plan: by which the frames are corrected.
-        stream: the plan of recon with the projections fed so far; None: none was fed.
-        columns: air columns with which projections were corrected.
-        fed: int64 [view], rows of the file that were fed and can be used.
+        plan: plan of the correction.
+        stream: the plan from `recon.prep` with the projections added so far; None: no projection was added.
+        columns: air columns with which the projections were corrected.
+        fed: int64 [view], rows of the file that were added and can be used.
     """
 
     plan: ScanCorrectionPlan
@@ -44,16 +46,16 @@ class FedCorrection:
 def feed(
     state: FedCorrection, frames: NDArray[np.int64], *, last: bool, warn: Warn | None = None
 ) -> tuple[Projections | None, FedCorrection]:
-    """Line integrals of the next frames, and the next state. None while no line integrals are ready, because the
-    newest projection waits for the next one.
+    """The line integrals of the next frames, and the next state. None instead of line integrals if none are ready,
+    because the newest projection waits for the next one.
 
     Args:
-        frames: rows of the file, those after the frames fed before; may be none if `last`.
-        last: no frame will come after these.
+        frames: rows of the file, after the frames that were added before; may be empty with `last`.
+        last: True if no frame will come after these.
         warn: as in `apply`.
 
     Raises:
-        DataError: as `apply`.
+        DataError: as for `apply`.
     """
     plan = state.plan
     data, usable = read_usable(plan, frames, None, warn)
@@ -66,17 +68,17 @@ def feed(
 
 
 def newest_lines(state: FedCorrection) -> Projections | None:
-    """Line integrals of the newest projection, which still waits for the next one, as if none followed.
+    """Line integrals of the newest projection, corrected as if no other projection followed.
 
-    It keeps waiting, because all its zingers are found only if both neighbours are known.
+    The projection keeps waiting, because all of its zingers can only be found when both neighbours are known.
     """
     none = np.empty((0, 0, 0), np.float32)
     return None if state.stream is None else apply_next(state.plan, none, NO_VIEWS, state.stream, last=True)[0]
 
 
 def outdated(state: FedCorrection) -> bool:
-    """True if projections already fed would now be corrected differently: references came later, the air columns
-    changed, or neighbours in angle were not known then.
+    """True if projections that were already added would now be corrected differently: darks or flats came later, the
+    air columns changed, or neighbours in angle were not known at that time.
     """
     plan = state.plan
     finds_spots = np.isfinite(plan.settings.zinger_threshold)
@@ -89,6 +91,8 @@ def outdated(state: FedCorrection) -> bool:
 
 
 def ignores_shadow(state: FedCorrection, views: NDArray[np.int64]) -> bool:
-    """True if an object in the beam of all these projections of a finished scan was treated as part of the sample."""
+    """True if an object that is in the beam of all these projections of a finished scan was treated as part of the
+    sample.
+    """
     shadow = None if state.plan.shadow is not None else in_shadow(state.plan, views).shadow
     return shadow is not None and any(part.any() for part in shadow)

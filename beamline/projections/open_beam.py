@@ -1,4 +1,4 @@
-"""Open beam of a scan: objects that stand in the beam of all projections, and photon statistics."""
+"""Open beam of a scan: finds objects that are in the beam of all projections, and the photon statistics."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from recon.prep.lines_plan import LinesPlan
 from recon.prep.references import SHADOW_REACH, References, shadowed
 from recon.prep.unmeasured import foreign_rows
 
-# for an object in the beam: fewest and most projections that are examined, and rows at a time
+# search for an object in the beam: fewest and most projections that are examined, and rows at a time
 _LEAST_VIEWS, SHADOW_VIEWS, _BAND = 8, 16, 64
 
-# bool [row, col], objects in the beam of all projections; bool [row], rows in which objects other than the sample come
-# and go (`foreign_rows`).
+# bool [row, col], objects that are in the beam of all projections; bool [row], rows in which objects other than the
+# sample come and go (`foreign_rows`)
 Shadow = tuple[Mask, Mask]
 
 
@@ -38,11 +38,12 @@ def shadow_on_counts(
     references: References,
     settings: CorrectionSettings,
 ) -> Shadow | None:
-    """Objects in the beam of all projections of a scan in counts, found in some of these; None if they are too few.
+    """Objects that are in the beam of all projections of a scan in counts, found from some projections. None if there
+    are too few projections.
 
     Args:
         read: the detector rows that are read.
-        references: of these rows, binned.
+        references: darks and flats of these rows, binned.
     """
     if views.size < _LEAST_VIEWS:
         return None
@@ -61,7 +62,9 @@ def shadow_on_counts(
 
 
 def shadow_on_lines(source: ScanSource, views: NDArray[np.int64], read: slice, binning: int) -> Shadow | None:
-    """As `shadow_on_counts`, for line integrals, which do not show objects that stand still in all projections."""
+    """Like `shadow_on_counts`, but for line integrals. Objects that stand still in all projections are not visible in
+    line integrals.
+    """
     if views.size < SHADOW_VIEWS:
         return None
     some = spread(views, SHADOW_VIEWS)
@@ -70,19 +73,19 @@ def shadow_on_lines(source: ScanSource, views: NDArray[np.int64], read: slice, b
     return np.zeros(lines.data.shape[1:], np.bool_), foreign
 
 
-_PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's range on either side
-_TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not make the gain more accurate, they only take time to read
+_PHOTONS = 1e-3, 1e12  # photons in a pixel of the open beam; limits far beyond the range of any detector
+_TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more projections do not make the gain more accurate, and take time to read
 
 
 def photons_of(scan: SelectedScan, references: References) -> Photons | None:
-    """Photon statistics of the (binned) pixels of a scan; None if logarithms are to be taken.
+    """Photon statistics of the (binned) pixels of a scan; None if line integrals are computed with logarithms.
 
-    The gain is that of the selection, or from the photon transfer of the largest group of flats. The readout noise
-    is that of the largest group of darks.
+    The gain is the value in the selection, or follows from the photon transfer of the largest group of flats. The
+    readout noise follows from the largest group of darks.
 
     Raises:
-        ConfigError: photon statistics were requested but the flats do not determine the gain; or the given gain means a
-            number of photons in the open beam that is too large or too small for any detector.
+        ConfigError: photon statistics were requested, but the flats do not determine the gain. Also if the given gain
+            means more or fewer photons in the open beam than any detector can count.
     """
     selection = scan.selection
     model = selection.step(Preparation)
@@ -96,7 +99,7 @@ def photons_of(scan: SelectedScan, references: References) -> Photons | None:
         read_binned(source, np.setdiff1d(max(groups, key=len), spoilt)[:_TRANSFER_FRAMES], middle, binning)
         for groups in (scan.evidence.used.flats, scan.evidence.used.darks)
     )
-    if model.gain is not None:  # a mean of n pixels has n times as many photons per count
+    if model.gain is not None:  # one count of a mean over n pixels stands for n times as many photons
         light = _counts_of_light(references) * binning**2 / model.gain
         low, high = _PHOTONS
         if not low <= light <= high:
@@ -116,7 +119,7 @@ def photons_of(scan: SelectedScan, references: References) -> Photons | None:
                 "Give --gain COUNTS for --noise counts, because the counts per photon could not be found "
                 f"in {source.path}: {error}."
             ) from error
-    # A mean of n frames also has n times as many photons per count; flats and darks are single frames.
+    # one count of a mean over n frames also stands for n times as many photons; flats and darks are single frames
     photons = Photons(photons.gain / source.frames_per_view, photons.variance / source.frames_per_view)
     if model.noise == "auto" and not light_of(references, photons) < FEW_PHOTONS:
         return None
@@ -124,7 +127,7 @@ def photons_of(scan: SelectedScan, references: References) -> Photons | None:
 
 
 def light_of(references: References, photons: Photons) -> float:
-    """Photons per pixel in the open beam, the median of the flats inside the beam, see `lit_places`."""
+    """Photons per pixel in the open beam: the median of the flats over the pixels in the beam, see `lit_places`."""
     return _counts_of_light(references) / photons.gain
 
 
@@ -134,7 +137,7 @@ def _counts_of_light(references: References) -> float:
 
 
 def noise_sentence(references: References, photons: Photons | None) -> str:
-    """How counts are converted to line integrals, in words; empty if with logarithms."""
+    """A sentence that says how counts are converted to line integrals; empty if they are converted with logarithms."""
     if photons is None:
         return ""
     light, readout = light_of(references, photons), photons.variance**0.5

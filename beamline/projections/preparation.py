@@ -1,4 +1,6 @@
-"""Preparation: how flags, darks, flats and counts of a scan are used until its frames are line integrals."""
+"""Preparation: settings for the use of flags, darks, flats and counts, when the frames of a scan are converted to line
+integrals.
+"""
 
 from __future__ import annotations
 
@@ -18,16 +20,17 @@ class Preparation:
     """How frames are converted to line integrals. `checked_views` and `OpenBeam` follow these settings.
 
     Attributes:
-        flags: "use": projections with an alarm are left out, those with a warning get less weight. "judge": the
-            monitor checks the frames now, and its flags replace those of the file. "ignore": all projections have
-            equal weight.
-        references: "accept": darks and flats are used as they are, also saturated, dark, uneven ones, and darks
-            exposed to the beam.
+        flags: "use": projections with an alarm are left out, those with a warning get less weight. "judge": the monitor
+            checks the frames now, and the new flags replace the flags in the file. "ignore": all projections have equal
+            weight.
+        references: "accept": all darks and flats are used as they are, even if they are saturated, dark or uneven, or
+            if darks were exposed to the beam.
         noise: "log": logarithms of counts; "counts": line integrals and weights that represent the likelihood of the
             counts; "auto": "counts" if the open beam has few photons per pixel.
-        gain: counts per photon, of single pixels; None: found from the flats.
+        gain: counts per photon of a single pixel; None: found from the flats.
         flat_fields: "groups": a projection's flat is interpolated between groups of flats; "dynamic": principal
-            components of the flats are added as the projection shows them, see `recon.prep.dynamic_flats`.
+            components of the flats are added with the amplitudes that the projection shows, see
+            `recon.prep.dynamic_flats`.
         ring_current: "use": projections and flats are divided by the ring current that the file has for each frame.
         floor, hot_threshold, zinger_threshold: which pixels are replaced with values of their neighbours, see
             `recon.prep.counts_plan.CorrectionSettings`.
@@ -96,7 +99,7 @@ class Preparation:
 
     @property
     def uses_flags(self) -> bool:
-        """True if flags, those of the file or new ones, decide how projections are used."""
+        """True if flags (those in the file, or new ones) decide how projections are used."""
         return self.flags != "ignore"
 
     @property
@@ -116,7 +119,7 @@ class Preparation:
 
     @property
     def done(self) -> StepDone:
-        """What the volume's file records of the preparation, apart from the record of `OpenBeam`."""
+        """What the file of the volume records about the preparation, apart from the record of `OpenBeam`."""
         return StepDone(parameters={"flags": self.flags, "references": self.references})
 
     @property

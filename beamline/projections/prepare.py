@@ -1,5 +1,5 @@
-"""Preparation of a scan: reads, corrects and aligns the chosen projections. Only the projections and rows asked for
-are held in memory.
+"""Preparation of a scan: reads, corrects and aligns the chosen projections. Only the selected projections and rows are
+in memory.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from beamline.projections.consistency import compare_with_flats, warn_of_inconsi
 from beamline.projections.correction import ScanCorrectionPlan, apply, apply_in_batches, survey, with_filters_of
 from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
-from beamline.projections.prepared import Corrected, PreparedProjections
+from beamline.projections.prepared import Corrected, PreparedProjections, ScanOrigin, WeightSources
 from beamline.projections.protocols import EstimatedStep, ScanStep, ViewStep
 from beamline.projections.read import NoViewError, ViewFilters
 from beamline.projections.registry import geometry_steps, in_order
@@ -51,11 +51,12 @@ HELD_OUT_VIEWS = 16
 
 @dataclass(frozen=True, eq=False)
 class DiskBuffer:
-    """Line integrals on disk instead of in memory, for work in slabs.
+    """Line integrals on disk instead of in memory, for a reconstruction in slabs.
 
     Attributes:
-        views: float32 [view, row, col], at least `HELD_OUT_VIEWS` more than are chosen: takes the line integrals.
-        batch: number of projections that are corrected at a time.
+        views: float32 [view, row, col], with room for at least `HELD_OUT_VIEWS` more projections than are selected:
+            receives the line integrals.
+        batch: number of projections that are corrected together.
     """
 
     views: NDArray[np.float32]
@@ -73,9 +74,9 @@ def prepare_projections(
 
     Args:
         scan: a finished scan.
-        warn: function that gets a sentence on everything that is unusual but does not stop the work.
-        buffer: takes the line integrals on disk, with missing rays and rays of weight 0 (because of flags)
-            interpolated, and no `shares`; None: they stay in memory.
+        warn: function that gets a sentence about everything that is unusual but does not stop the work.
+        buffer: receives the line integrals on disk; missing rays, and rays with weight 0 because of flags, are
+        interpolated, and `shares` is None. None: line integrals stay in memory.
         check: raises an error if the geometry of the projections is wrong, before they are corrected.
         phases: function that gets the name of each phase when the phase begins.
 
@@ -110,28 +111,29 @@ def prepare_projections(
         scan = scan.with_steps(*estimated)
         plan = with_filters_of(plan, scan, usable.frames)
         if any(step.on(scan)[0] is not None for step in estimated):
-            projections = _corrected(plan, used, buffer, phases)  # whatever is unusual in the frames was reported
+            # anything unusual in the frames has already been reported
+            projections = _corrected(plan, used, buffer, phases)
     light = compare_with_flats(scan, projections, warn)
     phases.enter("background, rings, held-out projections, hardening", "corrections")
     place = view_geometry.axis_col, axis
     prepared = assemble(scan, projections, geometry, place, usable, warn, buffer is not None)
-    del projections  # their line integrals may be copied next
+    del projections  # the line integrals may be copied next
     if others.size:
         with suppress(NoViewError):
             held_out = apply(plan, others, warn=warn)
             room = None if buffer is None else buffer.views
             prepared = prepared.with_held_out(held_out, view_geometry.of(held_out.view_ids), room)
-    prepared = replace(prepared, done={**plan.done, **tilt, **view_geometry.done})
+    prepared = prepared.stating(done={**plan.done, **tilt, **view_geometry.done})
     prepared = with_reach(scan, _after_scan_steps(scan, prepared, phases))  # the steps changed line integrals
-    prepared = replace(prepared, laws={**light, **warn_of_inconsistency(prepared.centred, scan.selection, warn)})
+    prepared = prepared.stating(laws={**light, **warn_of_inconsistency(prepared.centred, scan.selection, warn)})
     return prepared if buffer is None else _with_unknown_filled(prepared)
 
 
 def _estimated(scan: SelectedScan, projections: Projections, geometry: Geometry) -> list[ViewStep]:
     """The steps whose settings follow from the corrected projections, with these settings."""
     steps = [step for step in in_order(scan.selection) if isinstance(step, EstimatedStep)]
-    found = [step.estimated(scan, projections, geometry) for step in steps]
-    return [step for step in found if step is not None]
+    estimated = [step.estimated(scan, projections, geometry) for step in steps]
+    return [step for step in estimated if step is not None]
 
 
 def require_usable(scan: SelectedScan) -> None:
@@ -141,7 +143,7 @@ def require_usable(scan: SelectedScan) -> None:
 
 
 def _usable(scan: SelectedScan, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:
-    """The usable projections, their stated poses, and rows of offset projections; raises errors for faults before
+    """The usable projections, their stated poses, and the rows of offset projections. Raises errors for faults before
     any frame is read.
     """
     source, selection = scan.source, scan.selection
@@ -161,7 +163,7 @@ def _usable(scan: SelectedScan, warn: Warn) -> tuple[UsableViews, ScanPoses | No
 def _chosen(
     view_geometry: ViewGeometry, usable: UsableViews, poses: ScanPoses | None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of the file of the projections that are used, and of some others that are held out."""
+    """Rows of the file of the projections that are used, and of some further projections that are held out."""
     scan, frames = view_geometry.scan, usable.frames
     chosen = choose_views(scan, frames, view_geometry.of(frames).period)
     used, rest = frames[chosen], np.delete(frames, chosen)
@@ -178,7 +180,7 @@ def _corrected(
     phases: Phases,
     warn: Warn | None = None,
 ) -> Projections:
-    """Line integrals of these rows of the file. DataError if fewer than half of them can be used."""
+    """Line integrals of these rows of the file. Raises DataError if fewer than half of the rows can be used."""
     if buffer is None:
         projections = apply(plan, used, None, warn, phases.progress)
     else:
@@ -193,9 +195,9 @@ def _corrected(
 
 
 def _after_scan_steps(scan: SelectedScan, prepared: PreparedProjections, phases: Phases) -> PreparedProjections:
-    """The projections after the steps on all of them, which change line integrals in place."""
-    done, steps = dict(prepared.done), [step for step in in_order(scan.selection) if isinstance(step, ScanStep)]
-    prepared = replace(prepared, done=done)  # a step has access to what the steps before it did
+    """The projections after the steps that work on all projections. The steps change line integrals in place."""
+    done, steps = dict(prepared.origin.done), [step for step in in_order(scan.selection) if isinstance(step, ScanStep)]
+    prepared = prepared.stating(done=done)  # each step has access to the results of the steps before it
     for n, step in enumerate(steps, 1):
         done[step.name] = step.apply(prepared, scan.source.table.angles[prepared.ids], phases.progress)
         phases.progress(n, len(steps))
@@ -203,17 +205,17 @@ def _after_scan_steps(scan: SelectedScan, prepared: PreparedProjections, phases:
 
 
 def _with_unknown_filled(prepared: PreparedProjections) -> PreparedProjections:
-    """Fill rays of weight 0 (see `ray_weights`), projection by projection and in place, as is done for pixels
-    `masked` in all projections.
+    """Interpolate rays with weight 0 (see `ray_weights`), projection by projection and in place, in the same way as
+    pixels that are `masked` in all projections.
     """
     data, geometry = prepared.seen.data, prepared.geometry
     seen = seen_rays(geometry, Grid.matching(geometry)) if prepared.leaves_slices else None
     for view in range(len(data)):
         weights = np.ones(geometry.detector_shape, np.float32)
-        if prepared.measured is not None:
-            weights *= prepared.measured
-        if prepared.shares_of is not None:
-            shares = prepared.shares_of(slice(view, view + 1), slice(0, len(weights)))
+        if prepared.sources.measured is not None:
+            weights *= prepared.sources.measured
+        if prepared.sources.shares_of is not None:
+            shares = prepared.sources.shares_of(slice(view, view + 1), slice(0, len(weights)))
             weights *= 1 if shares is None else shares[0]
         if seen is not None:
             weights *= seen[view]
@@ -231,16 +233,16 @@ def assemble(
     warn: Warn,
     on_disk: bool = False,
 ) -> PreparedProjections:
-    """Corrected projections with their geometry, after reporting the pixels that the correction replaced.
+    """The corrected projections with their geometry. Before, warnings report the pixels that the correction replaced.
 
     Args:
-        geometry: of these projections.
-        axis: the column, and how it was found; None if it was given.
-        usable: the projections from which the selection chose.
-        on_disk: weights of rays in the regions of flags are computed on request.
+        geometry: geometry of these projections.
+        axis: column of the axis, and how it was found (None if the user gave it).
+        usable: the usable projections, from which the selection chose.
+        on_disk: True: weights of rays in the regions of flags are computed when they are needed.
 
     Raises:
-        DataError: fewer than two projections, or nothing in the beam.
+        DataError: there are fewer than two projections, or no sample is in the beam.
     """
     source, selection, (height, width) = scan.source, scan.selection, geometry.detector_shape
     rows = selection.detector_rows
@@ -266,17 +268,21 @@ def assemble(
     prepared = PreparedProjections(
         lines=Views(projections.data, geometry, projections.weights, ids),
         corrected=Corrected.of(projections),
-        axis_col=axis[0],
-        axis=axis[1],
-        n_projections=source.table.views.size,
-        length_unit="px" if selection.pixel_size_mm is None else "mm",
-        quantity=source.quantity,
-        view_weights=usable.weights_of(ids),
-        left_out=usable.left_out,
-        flags=usable.flags,
-        shares=None if on_disk else shares_of(slice(None), slice(0, height)),
-        measured=~unknown if unknown.any() else None,
-        shares_of=shares_of if on_disk and regions.mark(ids) else None,
+        origin=ScanOrigin(
+            axis_col=axis[0],
+            axis=axis[1],
+            n_projections=source.table.views.size,
+            length_unit="px" if selection.pixel_size_mm is None else "mm",
+            quantity=source.quantity,
+            left_out=usable.left_out,
+            flags=usable.flags,
+        ),
+        sources=WeightSources(
+            usable.weights_of(ids),
+            ~unknown if unknown.any() else None,
+            None if on_disk else shares_of(slice(None), slice(0, height)),
+            shares_of if on_disk and regions.mark(ids) else None,
+        ),
         stretch=_stretch(source, geometry, resampled=resampling is not None),
     )
     prepared = with_reach(scan, prepared)
@@ -286,15 +292,17 @@ def assemble(
 
 
 def with_reach(scan: SelectedScan, prepared: PreparedProjections) -> PreparedProjections:
-    """The projections with the reach of the sample that they show; its radius is known only if the user gave it."""
+    """The projections with the reach of the sample, measured from them. The radius is known only if the user gave
+    it.
+    """
     width = scan.selection.sample_width
-    views = replace(prepared.seen, weights=prepared.shares, reach=None)
+    views = replace(prepared.seen, weights=prepared.sources.shares, reach=None)
     reach = reach_of(views) if width is None else whole_reach(views, width / 2)
     return replace(prepared, lines=replace(prepared.lines, reach=reach))
 
 
 def _stretch(source: ScanSource, geometry: Geometry, *, resampled: bool) -> float:
-    """Height of the source's pixels divided by their width.
+    """Height of a pixel divided by its width.
 
     Raises:
         DataError: pixels are not square, and a detector row does not show one slice.

@@ -23,7 +23,7 @@ from recon.voxels.projector import seen_rays
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """What the correction changed in projections; the attributes are those of `Projections`."""
+    """What the correction changed in projections. The attributes have the same meaning as in `Projections`."""
 
     floored: float
     air: F32
@@ -39,56 +39,102 @@ class Corrected:
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedProjections:
-    """Line integrals ready for reconstruction, and where they come from.
+class ScanOrigin:
+    """Where projections come from. Only files, reports and messages state these facts.
 
     Attributes:
-        lines: line integrals of all projections, those that are used first; `ids` are rows of the file, `used` is False
-            for projections that are held out. `weights` come from photon counts, inverse variances; None: photons were
-            not counted. `reach` is measured on the projections used. The geometry is binned; mm, or px if the pixel
-            size is unknown.
-        corrected: what the correction changed in the projections used.
         axis_col: rotation axis in columns of the full detector.
-        axis: how the axis was found; None if it was given.
-        n_projections: how many projections the scan has.
+        axis: how the axis was found; None if the user gave it.
+        n_projections: number of projections of the scan.
         length_unit: "mm" or "px".
-        quantity: what the pixels were: "counts", which were corrected, or "line_integrals".
-        view_weights: float32 [view used], less than 1 for projections with a warning of the monitor; None: 1 for all.
-        left_out: projections with an alarm of the monitor, or after a jump of the sample: the selection never includes
-            them.
-        flags: of all frames of the scan; None if the file has no flags.
-        measured: bool [row, col], pixels that were measured, or interpolated well; None: all.
-        shares: float32 [view used, row, col], weights of rays in the regions of flags; None: all 1.
+        quantity: quantity of the stored pixels: "counts", which were corrected, or "line_integrals".
+        left_out: projections with an alarm of the monitor, or after a jump of the sample. The selection never includes
+            these.
+        flags: flags of all frames of the scan; None if the file has no flags.
         done: what each step did, by name, in the order of the steps.
-        shares_of: function that computes `shares` of some projections and rows on request, if line integrals are on
-            disk; None: use `shares`.
-        times: [view used] time of the exposure of each projection in s; None: the method does not need it.
-        laws: the residuals of the consistency conditions, in words, by name.
-        stretch: height of a pixel divided by its width. `geometry` has square pixels; slices are this much farther
-            apart.
+        laws: the residuals of the consistency conditions in words, by name.
     """
 
-    lines: Views
-    corrected: Corrected
     axis_col: float
     axis: AxisEstimate | None
     n_projections: int
     length_unit: str
     quantity: str
-    view_weights: NDArray[np.float32] | None = None
     left_out: int = 0
     flags: FrameFlags | None = None
-    measured: NDArray[np.bool_] | None = None
-    shares: NDArray[np.float32] | None = None
     done: Mapping[str, StepDone] = field(default_factory=dict)
-    shares_of: Callable[[slice, slice], NDArray[np.float32] | None] | None = None
+    laws: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class WeightSources:
+    """What lowers the weights of rays, in addition to the noise of counted photons.
+
+    Attributes:
+        of_views: float32 [view used], less than 1 for projections with a warning of the monitor; None: 1 for all.
+        measured: bool [row, col], pixels that were measured or could be interpolated well; None: all pixels.
+        shares: float32 [view used, row, col], weights of rays in the regions of flags; None: all weights are 1.
+        shares_of: function that computes `shares` of some projections and rows on request, if line integrals are on
+            disk; None: use `shares`.
+    """
+
+    of_views: F32 | None = None
+    measured: Mask | None = None
+    shares: F32 | None = None
+    shares_of: Callable[[slice, slice], F32 | None] | None = None
+
+    def views(self, views: I64) -> WeightSources:
+        """Those of only these of the projections used."""
+        return replace(self, of_views=_cut(self.of_views, views), shares=_cut(self.shares, views))
+
+    def rows(self, rows: slice) -> WeightSources:
+        """Those of only these detector rows, with the shares computed."""
+        part = (..., rows, slice(None))
+        shares = _cut(self.shares, part) if self.shares_of is None else self.shares_of(slice(None), rows)
+        return replace(self, measured=_cut(self.measured, part), shares=shares, shares_of=None)
+
+    @property
+    def without_warnings(self) -> WeightSources:
+        """Those without the warnings of the monitor: missing rays have weight 0, all others weight 1."""
+        shares = None if self.shares is None else (self.shares > 0).astype(np.float32)
+        return replace(self, of_views=None, shares=shares, shares_of=None)
+
+
+def _cut(array: NDArray[Any] | None, part: Any) -> Any:
+    return None if array is None else array[part]
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedProjections:
+    """Line integrals that are ready for reconstruction, and facts about their origin.
+
+    Attributes:
+        lines: line integrals of all projections; the projections that are used come first. `ids` are rows of the file.
+            `used` is False for held-out projections. `weights` are inverse variances from photon counts; None: photons
+            were not counted. `reach` is measured on the projections used. The geometry is binned, in mm, or in px if
+            the pixel size is unknown.
+        corrected: what the correction changed in the projections used.
+        origin: where the projections come from.
+        sources: what lowers the weights of rays.
+        times: [view used] time of the exposure of each projection in s; None: the method does not need it.
+        stretch: height of a pixel divided by its width. `geometry` has square pixels; the distance between slices is
+            larger by this factor.
+    """
+
+    lines: Views
+    corrected: Corrected
+    origin: ScanOrigin
+    sources: WeightSources = WeightSources()
     times: NDArray[np.float64] | None = None
     stretch: float = 1.0
-    laws: Mapping[str, str] = field(default_factory=dict)
+
+    def stating(self, **facts: Any) -> PreparedProjections:
+        """The same projections with these facts about their origin."""
+        return replace(self, origin=replace(self.origin, **facts))
 
     @property
     def views(self) -> Views:
-        """All projections, with weights that are computed on request."""
+        """All projections, with weights that are computed when they are needed."""
         return replace(self.lines, weights=self._ray_factors())
 
     @property
@@ -120,7 +166,7 @@ class PreparedProjections:
         return len(self.lines.data) - self.lines.held_out.size
 
     def stretched(self, volume: Volume) -> Volume:
-        """A volume of `geometry`, resampled to the heights of its slices."""
+        """A volume of `geometry`, resampled to the true heights of its slices."""
         if self.stretch == 1:
             return volume
         grid, (z, y, x) = volume.grid, volume.grid.centre
@@ -129,26 +175,23 @@ class PreparedProjections:
 
     @property
     def box(self) -> Grid:
-        """The box of the field of view, or one that contains all of the sample, as far as its reach was measured."""
+        """The box of the field of view; or, if the measured reach of the sample is larger, a box that contains the
+        sample.
+        """
         grid, reach = Grid.matching(self.geometry), self.lines.reach
         return grid if reach is None else reach.box(grid, self.geometry)
 
     def of_rows(self, rows: slice, geometry: Geometry) -> PreparedProjections:
         """The same projections restricted to the detector rows of `geometry`; line integrals are not copied."""
 
-        def cut(array: NDArray[Any] | None) -> Any:
-            return None if array is None else array[..., rows, :]
-
         whole = self.lines
-        shares = cut(self.shares) if self.shares_of is None else self.shares_of(slice(None), rows)
         part = whole.geometry.rows(rows.start, rows.stop) if whole.held_out.size else geometry
+        weights = _cut(whole.weights, (..., rows, slice(None)))
         return replace(
             self,
-            lines=replace(whole, data=whole.data[:, rows], geometry=part, weights=cut(whole.weights)),
+            lines=replace(whole, data=whole.data[:, rows], geometry=part, weights=weights),
             corrected=replace(self.corrected, masked=self.corrected.masked[rows]),
-            measured=cut(self.measured),
-            shares=shares,
-            shares_of=None,
+            sources=self.sources.rows(rows),
         )
 
     @property
@@ -159,39 +202,34 @@ class PreparedProjections:
         return self.wanted(self.geometry.is_centred)
 
     def wanted(self, views: NDArray[np.bool_]) -> PreparedProjections:
-        """The same projections, restricted to those that are wanted, bool [view used]."""
+        """The same data with only the projections that `wanted` selects, bool [view used]."""
         return self if views.all() else self.of_views(np.flatnonzero(views))
 
     def of_views(self, views: I64) -> PreparedProjections:
-        """Some of the projections used, by number and in this order; held-out projections are unchanged."""
+        """The same data with only these of the projections used, by number and in this order. Held-out projections are
+        unchanged.
+        """
         return self._of(self.lines.using(views), views)
 
     def _of(self, lines: Views, views: I64) -> PreparedProjections:
-        """These line integrals, of which those with the numbers `views` are used."""
+        """These line integrals. The projections with the numbers `views` are used."""
 
-        def some(array: Any) -> Any:
-            return None if array is None else array[views]
-
+        air = replace(self.corrected, air=self.corrected.air[views])
         return replace(
-            self,
-            lines=lines,
-            corrected=replace(self.corrected, air=self.corrected.air[views]),
-            view_weights=some(self.view_weights),
-            shares=some(self.shares),
-            times=some(self.times),
+            self, lines=lines, corrected=air, sources=self.sources.views(views), times=_cut(self.times, views)
         )
 
     def holding_out(self, held: I64) -> PreparedProjections:
-        """The same projections with those of these numbers, sorted, held out; all of them were used before."""
+        """The same data with the projections of these numbers (sorted) held out. All of them were used before."""
         return self._of(self.lines.holding_out(held), np.setdiff1d(np.arange(self.n_used), held))
 
     def with_held_out(self, others: Projections, geometry: Geometry, room: F32 | None = None) -> PreparedProjections:
-        """The same projections, all of which are used, followed by others that are held out.
+        """The same projections, which are all used, followed by other projections that are held out.
 
         Args:
-            geometry: of the others.
-            room: array that begins with the line integrals of these projections and takes those of the others; None: a
-                new array.
+            geometry: geometry of the other projections.
+            room: array that begins with the line integrals of these projections and has room for the others; None: a
+                new array is made.
         """
         lines, n, more = self.lines, len(self.lines.data), len(others.data)
         if room is None:
@@ -207,31 +245,31 @@ class PreparedProjections:
 
     @property
     def whole_views(self) -> I64:
-        """Numbers of the projections in which every pixel measured something, except for pixels that are masked in
-        all.
+        """Numbers of the projections in which every pixel has data, except for pixels that are masked in all
+        projections.
         """
         return np.flatnonzero(~np.isin(self.ids, self.corrected.unmeasured[:, 0]))
 
     @property
     def unmeasured_rows(self) -> tuple[I64, I64]:
-        """Detector rows, binned, that no ray measured; and those of them that lie between measured rows, such as a
-        line that the camera does not read, and are interpolated.
+        """Two sets of binned detector rows. (1) Rows that no ray measured. (2) Those of them that lie between measured
+        rows and are interpolated, such as a line that the camera does not read.
         """
         ids, (height, width) = self.ids, self.geometry.detector_shape
         runs = self.corrected.unmeasured
-        known = np.ones((height, width), np.bool_) if self.measured is None else self.measured
-        # [row, col + 1], number of known pixels to the left
+        known = np.ones((height, width), np.bool_) if self.sources.measured is None else self.sources.measured
+        # [row, col + 1], number of known pixels to the left of the column
         before = np.pad(np.cumsum(known, axis=1), ((0, 0), (1, 0)))
-        _, row, left, right = runs[np.isin(runs[:, 0], ids)].T  # of these projections
-        lengths = before[row, right] - before[row, left]  # runs end at masked areas
+        _, row, left, right = runs[np.isin(runs[:, 0], ids)].T  # runs of these projections
+        lengths = before[row, right] - before[row, left]  # a run ends at a masked area
         unseen = np.bincount(row, lengths, height) >= before[:, -1] * ids.size
         lost = unseen | self.corrected.masked.all(axis=1)
         return np.flatnonzero(lost), np.flatnonzero(lost & ~unseen)
 
     @property
     def leaves_slices(self) -> bool:
-        """True if projections of a parallel beam see beyond the slices of the volume, because they are shifted along
-        the axis or tilted.
+        """True if projections of a parallel beam also see material above or below the slices of the volume, because
+        they are shifted along the axis or tilted.
         """
         geometry = self.geometry
         moved = np.ptp(geometry.shifts[:, 1]) > 0
@@ -239,29 +277,29 @@ class PreparedProjections:
 
     @property
     def without_warnings(self) -> PreparedProjections:
-        """The same projections without the warnings of the monitor: missing rays have weight 0, all others weight 1."""
-        shares = None if self.shares is None else (self.shares > 0).astype(np.float32)
-        return replace(self, view_weights=None, shares=shares, shares_of=None)
+        """The same projections without the warnings of the monitor, see `WeightSources`."""
+        return replace(self, sources=self.sources.without_warnings)
 
     def _ray_factors(self) -> RayWeights | None:
-        """Weights of all projections, computed only on request; None if all rays have weight 1.
+        """Weights of all projections, computed when they are needed; None if all rays have weight 1.
 
-        Held-out projections have the weight of a usual ray of those used, unless their photons were counted, too.
+        Rays of held-out projections get the usual weight of the projections used, unless their photons were counted,
+        too.
         """
         factors: list[NDArray[np.float32]] = []
-        n, geometry = self.n_used, self.geometry
+        n, geometry, sources = self.n_used, self.geometry, self.sources
         others = len(self.lines.data) - n
-        if self.view_weights is not None:
-            factors.append(_and_ones(self.view_weights, others)[:, None, None])
+        if sources.of_views is not None:
+            factors.append(_and_ones(sources.of_views, others)[:, None, None])
         if (counted := self.lines.weights) is not None:
             factors.append(counted / (used := counted[:n]).mean(where=used > 0))
-        if self.measured is not None:
-            factors.append(self.measured.astype(np.float32)[None])
+        if sources.measured is not None:
+            factors.append(sources.measured.astype(np.float32)[None])
         if self.leaves_slices:
             grid = Grid.matching(geometry)
             factors.append(seen_rays(self.lines.geometry, grid).astype(np.float32))
-        if self.shares is not None:
-            factors.append(_and_ones(self.shares, others))
+        if sources.shares is not None:
+            factors.append(_and_ones(sources.shares, others))
         if not factors:
             return None
         shape = (n + others, *geometry.detector_shape)
@@ -269,17 +307,17 @@ class PreparedProjections:
 
 
 def _and_ones(values: NDArray[np.float32], others: int) -> NDArray[np.float32]:
-    """The values of projections, and ones for others after them."""
+    """The values of the projections used, followed by ones for the other projections."""
     return np.concatenate((values, np.ones((others, *values.shape[1:]), np.float32)))
 
 
 def hold_out(
     prepared: PreparedProjections, one_in: int, *, most: int | None = None, advice: str
 ) -> PreparedProjections:
-    """Hold out every `one_in`-th projection, evenly spread; unchanged if the selection already holds some out.
+    """Hold out every `one_in`-th projection, evenly spread. Nothing changes if the selection already holds some out.
 
     Args:
-        most: number of held-out projections at most.
+        most: largest number of held-out projections.
         advice: what the user can do instead, for the error message.
 
     Raises:
@@ -292,5 +330,5 @@ def hold_out(
     count = count if most is None else min(count, most)
     if n - count < 2:
         raise ConfigError(f"{n} projections are too few to hold some out; choose more with --views, or {advice}.")
-    # Neither the first nor the last: these have a neighbour on one side only.
+    # The first and the last projection are not held out, because each has a neighbour on one side only.
     return prepared.holding_out(np.unique((np.arange(count) + 0.5) * n // count).astype(np.int64))

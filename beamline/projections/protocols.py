@@ -1,8 +1,8 @@
-"""Protocols of a correction step: settings of the conversion of counts, a filter of each projection, a search for the
-sample's position, or a change of all projections.
+"""Protocols of a correction step. A step sets how counts are converted, filters each projection, finds the position of
+the sample, or changes all projections.
 
-A plug-in meets one of `ViewStep`, `PlaceStep` and `ScanStep`. The module of a step is imported for every help text:
-import what reads files or needs numba, torch or scipy in the function that uses it.
+A plug-in implements `ViewStep`, `PlaceStep` or `ScanStep`. The module of a step is imported for every help text.
+Therefore import modules that read files or need numba, torch or scipy inside the function that uses them.
 """
 
 from __future__ import annotations
@@ -27,32 +27,34 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class ScanPart:
-    """The part of a scan that is to be used, before any frame is read.
+    """The part of a scan that will be used, described before any frame is read.
 
     Attributes:
-        geometry: of as many projections as are used, of the same size, binned.
+        geometry: a geometry with the number and the (binned) size of the projections that will be used.
     """
 
     scan: SelectedScan
     geometry: Geometry
 
     def view_bytes(self, reach: int = 0) -> int:
-        """Bytes of a float32 projection with this many more rows on either side, as far as the detector has them."""
+        """Size in bytes of a float32 projection with additional rows on either side, as far as the detector has
+        them.
+        """
         rows, cols = self.geometry.detector_shape
         return 4 * min(rows + 2 * reach, self.scan.source.shape[0] // self.scan.selection.binning) * cols
 
 
 class PrepStep(NamedStep, Protocol):
-    """A correction. Its ValueError on creation is bad usage."""
+    """A correction. A ValueError on creation means wrong usage."""
 
     @property
     def needs_finished(self) -> str:
-        """Why the step needs a finished scan, as a sentence for the user who follows a running one; empty: it does
-        not need one.
+        """A sentence for the user who follows a running scan that says why the step needs a finished scan. Empty: the
+        step does not need a finished scan.
         """
 
     def memory(self, part: ScanPart) -> StepMemory:
-        """The memory that the step needs, known before any frame is read.
+        """The memory that the step needs. It is computed before any frame is read.
 
         Raises:
             ConfigError: the step does not fit the scan.
@@ -64,18 +66,18 @@ class CountsStep(PrepStep, Protocol):
     """A step that sets how counts become line integrals."""
 
     def settings(self, before: CorrectionSettings) -> CorrectionSettings:
-        """These settings of the correction, changed as the options of the step say."""
+        """The settings of the correction, changed by the options of the step."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewFilter:
-    """A step on the projections of one scan, a batch at a time.
+    """A filter of the projections of one scan, which works on one batch at a time.
 
     Attributes:
-        apply: (projections, detector row at which they begin) to as many filtered projections; line integrals may be
-            changed in place.
-        reach: how many rows, binned, above and below a row it needs.
-        mixes: subject and verb of a sentence that says which option mixes neighbouring pixels.
+        apply: function of projections and of the detector row at which they begin. Returns the same number of filtered
+            projections; line integrals may be changed in place.
+        reach: number of binned rows above and below a row that the filter needs.
+        mixes: subject and verb of a sentence that says which option mixes neighbouring pixels; for messages.
     """
 
     apply: Callable[[Projections, int], Projections]
@@ -85,10 +87,10 @@ class ViewFilter:
 
 @runtime_checkable
 class ViewStep(PrepStep, Protocol):
-    """A step on each projection alone, also of a scan that is still running."""
+    """A step that changes each projection separately. It can also be used while a scan is running."""
 
     def on(self, scan: SelectedScan) -> tuple[ViewFilter | None, StepDone]:
-        """The filter of a scan, None if there is nothing to do; and what it does.
+        """The filter for a scan (None if there is nothing to do), and what the filter does.
 
         Raises:
             ConfigError: the scan does not state what the step needs, or the step does not fit it.
@@ -100,8 +102,8 @@ class EstimatedStep(Protocol):
     """A step whose settings may be estimated from the corrected projections of a finished scan."""
 
     def estimated(self, scan: SelectedScan, views: Projections, geometry: Geometry) -> ViewStep | None:
-        """The step with the settings that these projections, corrected without it, determine; None if they determine
-        none.
+        """The step with the settings that these projections determine; they are corrected without the step. None if
+        they determine no settings.
         """
 
 
@@ -110,7 +112,7 @@ class ViewMotion(Protocol):
 
     Attributes:
         frames: int64 [view], the rows of the file that are used.
-        done: what the step did; its sentence becomes a warning.
+        done: what the step did. The sentence in it becomes a warning.
     """
 
     @property
@@ -149,7 +151,7 @@ class PlaceStep(PrepStep, Protocol):
         axis_col: float,
         progress: Callable[[int, int], None],
     ) -> ViewMotion:
-        """The projections that are used, the position of the sample in them, and what was done.
+        """Find the projections to use and the position of the sample in them. The result also says what was done.
 
         Args:
             usable: the projections that may be used.
@@ -158,7 +160,7 @@ class PlaceStep(PrepStep, Protocol):
 
 
 class GeometryLearnt(Protocol):
-    """What was estimated of the geometry of some projections.
+    """The estimated geometry of some projections.
 
     Attributes:
         axis: displacement of the rotation axis in the detector's middle row, in columns.
@@ -172,7 +174,7 @@ class GeometryLearnt(Protocol):
     def done(self) -> StepDone: ...
 
     def corrected(self, geometry: Geometry, view_ids: NDArray[np.int64]) -> Geometry:
-        """The geometry of these rows of the file, which may be binned, as it was estimated."""
+        """The estimated geometry of these rows of the file, which may be binned."""
 
 
 @runtime_checkable
@@ -181,9 +183,9 @@ class GeometryStep(PrepStep, Protocol):
 
     Attributes:
         asked_by: the option that asks for it.
-        geometry: names of the terms that are to be estimated; with "roll", "tilt" and "shifts" a row may show other
-            slices.
-        may_lean: projections may come out rolled or tilted.
+        geometry: names of the terms that are to be estimated. With "roll", "tilt" or "shifts", a detector row may show
+            several slices.
+        may_lean: True if the estimated projections may be rolled or tilted.
     """
 
     asked_by: ClassVar[str]
@@ -195,9 +197,7 @@ class GeometryStep(PrepStep, Protocol):
     def may_lean(self) -> bool: ...
 
     def refuse_few(self, used: int, usable: int, cols: int) -> None:
-        """Raise DataError for terms that need more projections, used or usable, or more binned columns than there
-        are.
-        """
+        """Raise DataError if a term needs more projections (used or usable), or more binned columns, than there are."""
 
     def learn(
         self,
@@ -209,7 +209,7 @@ class GeometryStep(PrepStep, Protocol):
         """The geometry of these frames, from projections whose geometry is otherwise known.
 
         Raises:
-            DataError: too few projections, or nothing in the beam.
+            DataError: there are too few projections, or no sample is in the beam.
         """
 
 
@@ -223,7 +223,7 @@ class ScanStep(PrepStep, Protocol):
         """Change line integrals, weights and held-out projections in place.
 
         Args:
-            angles: [view] of the stage, radians.
+            angles: [view], angle of the stage in radians.
             progress: takes how much is done, and of how much at most.
 
         Raises:

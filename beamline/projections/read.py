@@ -1,4 +1,4 @@
-"""Reading: pixels of a scan, binned while they are read; which projections cannot be used; and the filters of
+"""Reads pixels of a scan and bins them, finds projections that cannot be used, and applies the filters of
 projections.
 """
 
@@ -27,7 +27,7 @@ from beamline.storage.rules.evidence import ScanEvidence
 from recon.prep.projections import Projections
 from recon.prep.references import References
 
-BATCH_BYTES = 64 * 2**20  # raw pixels read at a time
+BATCH_BYTES = 64 * 2**20  # number of raw pixels that are read together
 
 
 def read_binned(
@@ -39,9 +39,9 @@ def read_binned(
 ) -> NDArray[Any]:
     """Read frames [frame, row, col], averaged into bins; NaN is excluded from the averages.
 
-    Whole counts that are not binned keep their type (half the memory), everything else becomes float32. Trailing
-    columns that do not fill a bin are dropped. If a frame is spread over more compressed chunks than are kept
-    unpacked, all frames are read for a few rows at a time, otherwise all rows of a few frames.
+    Integer counts keep their type if they are not binned (half the memory); everything else becomes float32. Trailing
+    columns that do not fill a bin are dropped. If a frame is spread over more compressed chunks than are kept in
+    memory, a few rows of all frames are read at a time; otherwise all rows of a few frames.
     """
     height, width = (rows.stop - rows.start) // binning, source.shape[1] // binning
     whole = binning == 1 and source.dtype.kind in "ui"
@@ -60,21 +60,22 @@ def read_binned(
 
 
 def _held_by_rows(source: ScanSource) -> bool:
-    """True if a frame shares its chunks of the file with other frames, and the chunks are more than are kept
-    unpacked.
+    """True if a frame shares its chunks in the file with other frames, and there are more chunks than are kept in
+    memory.
     """
     frame = source.shape[0] * source.shape[1] * source.dtype.itemsize * source.frames_per_view
     return source.frame_bytes > max(HELD, 2 * frame)
 
 
 def reading_memory(source: ScanSource, frames: int, rows: slice, binning: int) -> int:
-    """Memory of `read_binned` in bytes, its result included."""
+    """Memory in bytes that `read_binned` needs, including its result."""
     pixels, itemsize = (rows.stop - rows.start) * source.shape[1], source.dtype.itemsize
     at_once = min(frames, max(1, BATCH_BYTES // max(1, pixels * itemsize))) * pixels
     of_file = min(source.frame_bytes, HELD)
     if binning == 1:
         return frames * pixels * (itemsize if source.dtype.kind in "ui" else 4) + at_once * itemsize + of_file
-    return 4 * frames * pixels // binning**2 + at_once * (itemsize + 4 + 2) + of_file  # as float32, with a mask
+    # as float32, with a mask of the finite values
+    return 4 * frames * pixels // binning**2 + at_once * (itemsize + 4 + 2) + of_file
 
 
 def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:
@@ -89,8 +90,8 @@ def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:
 
 
 def damaged_frames(scan: SelectedScan, frames: NDArray[np.int64]) -> tuple[NDArray[np.bool_], list[str]]:
-    """Which of these frames, which were read, are left out: unreadable frames and, unless the selection uses all,
-    frames that differ from their checksum. And sentences that list them.
+    """The frames that are left out after reading, and sentences that list them. Unreadable frames are left out, and
+    also frames that differ from their checksum, unless the selection uses all frames.
     """
     source = scan.source
     lost, sentences = np.isin(frames, sorted(source.unreadable)), list[str]()
@@ -112,18 +113,18 @@ def damaged_frames(scan: SelectedScan, frames: NDArray[np.int64]) -> tuple[NDArr
 
 
 def spoilt_frames(source: ScanSource, use_damaged: bool) -> list[int]:
-    """Rows read so far that cannot be used: unreadable ones, and those that differ from their checksum."""
+    """The rows read so far that cannot be used, because they are unreadable or differ from their checksum."""
     return sorted({*source.unreadable} | (set() if use_damaged else source.damaged))
 
 
 @dataclass(frozen=True, eq=False)
 class ViewFilters:
-    """The filters of one scan, in order.
+    """The filters for one scan, in the order in which they are applied.
 
     Attributes:
-        filters: in their order.
-        done: what each step on projections does, by name.
-        scan: with the rows asked for, and binning.
+        filters: the filters in this order.
+        done: what each step does, by name.
+        scan: the scan with the selected rows and binning.
     """
 
     filters: tuple[ViewFilter, ...]
@@ -135,7 +136,7 @@ class ViewFilters:
         """The filters of a selection.
 
         Raises:
-            ConfigError: filters of counted photons.
+            ConfigError: a filter would mix pixels whose photons are counted.
         """
         selection = scan.selection
         outcomes = {step.name: step.on(scan) for step in in_order(selection) if isinstance(step, ViewStep)}
@@ -153,7 +154,7 @@ class ViewFilters:
         return self._widened(rows)[0]
 
     def within(self, rows: slice | None) -> slice:
-        """The same rows, binned, as a slice of what is read for all rows."""
+        """These binned rows as a slice of the data that are read for all rows."""
         first, part = self.read(None).start, self.read(rows)
         return slice(*((edge - first) // self.scan.selection.binning for edge in (part.start, part.stop)))
 
@@ -167,7 +168,7 @@ class ViewFilters:
         return replace(views, data=np.ascontiguousarray(views.data[:, kept]), masked=views.masked[kept])
 
     def _widened(self, rows: slice | None) -> tuple[slice, slice]:
-        """Detector rows to read, and which of them were asked for, in binned rows."""
+        """The detector rows to read, and the requested rows among them, in binned rows."""
         n, reach = self.scan.selection.binning, sum(each.reach for each in self.filters)
         first, end = self.scan.selection.detector_rows.start, self.scan.selection.detector_rows.stop
         if rows is not None:
@@ -190,13 +191,13 @@ def read_views(
     warn: Warn | None = None,
     progress: Callable[[int, int], None] = lambda n, total: None,
 ) -> tuple[NDArray[Any], NDArray[np.int64]]:
-    """Pixels [frame, row, col] of the frames that have a finite pixel and intensity and are not damaged, and these
-    frames; of some binned rows, None: all.
+    """The usable frames, and their pixels [frame, row, col]. A usable frame has a finite pixel, has beam, and is not
+    damaged. `rows` are binned rows; None: all rows.
 
     Args:
-        references: of the rows that `filters` read, binned; None: the frames are line integrals.
-        warn: function that gets sentences on frames that are left out for another reason than a lack of beam (see
-            `unlit_sentence`), and on copies.
+        references: darks and flats of the rows that `filters` read, binned; None: the frames are line integrals.
+        warn: function that gets sentences about frames that are copies, and about frames that are left out, except if
+            they have no beam (see `unlit_sentence`).
     """
     scan, source = filters.scan.evidence, filters.scan.source
     data = read_binned(source, frames, filters.read(rows), filters.scan.selection.binning, progress)
@@ -205,7 +206,7 @@ def read_views(
     alive = np.isfinite(data).any(axis=(1, 2))
     if not alive.all():
         dark = frames[~alive]
-        if rows is None:  # a band of rows does not show whether a projection is usable
+        if rows is None:  # a band of rows is not enough to decide whether a projection is usable
             reported.append(
                 f"{dark.size} of {source.table.views.size} projections {'has' if dark.size == 1 else 'have'} no "
                 f"finite pixel and {'is' if dark.size == 1 else 'are'} left out (first: frame {dark[0]})."
@@ -213,8 +214,8 @@ def read_views(
         data, frames = data[alive], frames[alive]
     lit, part = np.ones(len(frames), np.bool_), filters.within(rows)
     beam = None if references is None else (references.dark[part], references.flats[0][1][part])
-    for at in np.flatnonzero(scan.suspect(data, beam)):
-        lit[at] = not scan.unlit(int(frames[at]))
+    for view in np.flatnonzero(scan.suspect(data, beam)):
+        lit[view] = not scan.unlit(int(frames[view]))
     if not lit.all():
         data, frames = data[lit], frames[lit]
     if warn is not None:
@@ -226,12 +227,14 @@ def read_views(
 
 
 def _copies(scan: ScanEvidence, data: NDArray[Any], frames: NDArray[np.int64]) -> list[str]:
-    """A sentence on projections that equal the one before pixel by pixel: no camera takes the same counts twice."""
+    """A sentence about projections whose pixels are all equal to those of the projection before, because no camera
+    takes the same counts twice.
+    """
     middle = data.shape[1] // 2
-    # the middle row quickly distinguishes most of them
+    # the middle row is enough to distinguish most projections quickly
     alike = np.flatnonzero((data[1:, middle] == data[:-1, middle]).all(axis=1))
-    copies = [int(frames[at + 1]) for at in alike if np.array_equal(data[at], data[at + 1])]
-    if not copies or 2 * len(copies) >= len(frames):  # if most are equal, the images were computed
+    copies = [int(frames[view + 1]) for view in alike if np.array_equal(data[view], data[view + 1])]
+    if not copies or 2 * len(copies) >= len(frames):  # if most projections are equal, the images were computed
         return []
     return [
         "Omit these frames with --views or --flags judge, or repeat them: "
@@ -243,7 +246,9 @@ def _copies(scan: ScanEvidence, data: NDArray[Any], frames: NDArray[np.int64]) -
 
 
 def unlit_sentence(scan: ScanEvidence, asked: NDArray[np.int64], lit: NDArray[np.int64]) -> str:
-    """The projections without beam among those asked for, and the gap that they leave; empty if there are none."""
+    """A sentence about requested projections without beam, and the gap in angle that they leave; empty if all
+    projections have beam.
+    """
     unlit = np.intersect1d(np.setdiff1d(asked, lit), np.array(scan.known_unlit, np.int64))
     if not unlit.size:
         return ""

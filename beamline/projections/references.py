@@ -1,4 +1,4 @@
-"""Flats and darks: which of them are used, and the open beam of each projection that they give."""
+"""Flats and darks: decides which of them are used, and computes the open beam of each projection."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _STEADY = 0.01  # relative change of the ring current; top-up keeps it this cons
 
 @dataclass(frozen=True, eq=False)
 class _Reading:
-    """Which pixels of darks and flats are read, binned, and the zingers found in them.
+    """Reads (binned) pixels of darks and flats, and finds the zingers in them.
 
     Attributes:
-        light: counts of the open beam.
-        spots: pixels of zingers, by frame.
+        light: counts in the open beam.
+        spots: number of pixels in zingers, by frame.
     """
 
     evidence: ScanEvidence
@@ -49,7 +49,7 @@ class _Reading:
         return cls(scan.evidence, rows, binning, not scan.selection.step(Preparation).uses_flags, light)
 
     def images(self, frames: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[Any]]]:
-        """The frames [row, col] that may be used, one by one, without zingers."""
+        """Yields the usable frames [row, col], without zingers."""
         used = list[int]()
 
         def good() -> Iterator[NDArray[Any]]:
@@ -59,15 +59,13 @@ class _Reading:
                     used.append(frame)
                     yield image
 
-        for at, (image, n) in enumerate(without_spots(good(), self.light)):
+        for number, (image, n) in enumerate(without_spots(good(), self.light)):
             if n:
-                self.spots[used[at]] = n
-            yield used[at], image
+                self.spots[used[number]] = n
+            yield used[number], image
 
     def mean(self, frames: NDArray[np.int64], weights: NDArray[np.float64] | None = None) -> NDArray[np.float64] | None:
-        """Mean of the frames that may be used, each multiplied by its weight [frame of the scan]; None if no frame
-        may be used.
-        """
+        """Mean of the usable frames, each multiplied by its weight [frame of the scan]. None if no frame is usable."""
         total: NDArray[np.float64] | float = 0.0
         n = 0
         for frame, image in self.images(frames):
@@ -76,14 +74,14 @@ class _Reading:
         return np.asarray(total / n) if n else None
 
     def darks(self, frames: NDArray[np.int64]) -> list[tuple[float, NDArray[np.float64]]]:
-        """(exposure in s, mean dark) of each exposure; (NaN, mean of all) if exposures are equal or unknown."""
+        """(exposure in s, mean dark) for each exposure. If exposures are equal or unknown: (NaN, mean of all darks)."""
         means = [(seconds, self.mean(some)) for seconds, some in self.evidence.by_exposure(frames)]
         return [(seconds, mean) for seconds, mean in means if mean is not None]
 
 
 def read_references(scan: SelectedScan, rows: slice) -> tuple[References, str]:
-    """Read the mean dark, and the mean of each group of flats with its position in the scan; both kinds are
-    required. Also returns a note on zingers, empty if there are none.
+    """Read the mean dark, and the mean of each group of flats with its position in the scan; both kinds are required.
+    Also returns a sentence about zingers; empty if there are no zingers.
 
     Damaged frames (see ScanSource) are left out, unless the selection uses all frames. Zingers in single frames are
     replaced. Flats with another exposure than the projections are scaled to the exposure of the
@@ -120,7 +118,7 @@ def read_references(scan: SelectedScan, rows: slice) -> tuple[References, str]:
 
 
 def _dark_of(exposure: float, darks: list[tuple[float, NDArray[np.float64]]]) -> NDArray[np.float64] | None:
-    """The dark of an exposure; the mean of all if the exposure is unknown. None without darks."""
+    """The dark for an exposure. The mean of all darks if the exposure is unknown; None if there are no darks."""
 
     if len(darks) < 2:
         return darks[0][1] if darks else None
@@ -128,7 +126,7 @@ def _dark_of(exposure: float, darks: list[tuple[float, NDArray[np.float64]]]) ->
 
 
 def with_dynamic_flats(scan: SelectedScan, references: References, rows: slice) -> References:
-    """The same references with the principal components of all flats that are used, which are read three times.
+    """The same references with the principal components of all flats that are used. The flats are read three times.
 
     Raises:
         ConfigError: there are too few flats.
@@ -154,8 +152,8 @@ def with_dynamic_flats(scan: SelectedScan, references: References, rows: slice) 
 
 
 def light_scale(scan: ScanEvidence, by_current: bool = False) -> NDArray[np.float64]:
-    """Factor [frame] that scales each frame from its own exposure to the projections' median; 1 if one is unknown.
-    With `by_current` also from its own ring current.
+    """[frame] factor that scales each frame from its exposure to the median exposure of the projections; 1 if an
+    exposure is unknown. With `by_current`, the ring current is scaled, too.
     """
 
     scale = _to_median(scan.exposures, scan.table.views)
@@ -163,16 +161,16 @@ def light_scale(scan: ScanEvidence, by_current: bool = False) -> NDArray[np.floa
 
 
 def _to_median(values: NDArray[np.float64], views: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The median of the projections divided by each frame's own value; 1 if one is unknown."""
+    """The median value of the projections divided by the value of each frame; 1 if a value is unknown."""
     known = values[views][np.isfinite(values[views])]
     return np.where(np.isfinite(values), np.median(known) / values, 1.0) if known.size else np.ones(values.size)
 
 
 def current_scale(scan: ScanEvidence) -> NDArray[np.float64]:
-    """Factor [frame] that scales each frame from its own ring current to the median of the projections.
+    """[frame] factor that scales each frame from its ring current to the median ring current of the projections.
 
     Raises:
-        ConfigError: the file has none for some projection or flat.
+        ConfigError: the file has no ring current for a projection or a flat.
     """
     used = scan.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)
     currents = scan.table.currents
@@ -200,7 +198,9 @@ def uncorrected_current(scan: SelectedScan) -> str:
 
 
 def flats_sentence(scan: ScanEvidence, references: References, by_current: bool) -> str:
-    """How changes of the beam and of the exposure were corrected, in words; empty if they were not."""
+    """A sentence that says how changes of the beam and of the exposure were corrected; empty if nothing was
+    corrected.
+    """
 
     sentences = []
     if scan.views_differ:
@@ -225,7 +225,7 @@ def flats_sentence(scan: ScanEvidence, references: References, by_current: bool)
 
 
 def parts_without_flats(scan: ScanEvidence, references: References) -> list[str]:
-    """A warning for each part of the scan whose projections are corrected with the flats of another part."""
+    """A warning for each part of the scan whose projections are corrected with flats of another part."""
     starts, warnings = scan.table.part_starts, list[str]()
     flats = [position for position, _ in references.flats]
     for start, end in zip(starts, [*starts[1:], len(scan.table)], strict=True):

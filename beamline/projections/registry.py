@@ -1,4 +1,4 @@
-"""Registry of the correction steps, one line per step. A new correction needs its file and its line here; a plug-in
+"""Registry of the correction steps, one line per step. For a new correction, add a file and a line here. A plug-in
 needs no line.
 """
 
@@ -27,12 +27,14 @@ REGISTRY: dict[str, str] = {
     "Width": "corrections.width",
     **{step: f"corrections.{module}" for step, module in _OF_FEATURES.items()},
 }
-"""Class, and its module here; options stand in this order. A folder in `corrections` lists its own in STEPS."""
+"""Classes of the steps and their modules. Help lists options in this order. A folder in `corrections` lists its own
+steps in STEPS.
+"""
 
 
 @cache
 def registered() -> tuple[type[PrepStep], ...]:
-    """Every step, in the order of the registry; steps of other packages come last."""
+    """Every step in the order of the registry. Steps of add-ons come last."""
     ours: list[type[PrepStep]] = [
         getattr(import_module(f"beamline.projections.{module}"), cls) for cls, module in REGISTRY.items()
     ]
@@ -58,14 +60,14 @@ def registered() -> tuple[type[PrepStep], ...]:
 
 @cache
 def all_steps() -> tuple[type[PrepStep], ...]:
-    """Every step, each after those that it follows."""
+    """Every step, each after the steps that it `follows`."""
     by_name: dict[str, type[PrepStep]] = {step.name: step for step in registered()}
     order = TopologicalSorter({name: step.follows for name, step in by_name.items()}).static_order()
-    return tuple(by_name[name] for name in order if name in by_name)  # a step may follow one that a feature provides
+    return tuple(by_name[name] for name in order if name in by_name)  # a step may follow a step that a feature provides
 
 
 def in_order(selection: Selection) -> list[PrepStep]:
-    """Every step with the settings of the selection, each after those that it follows."""
+    """Every step with the settings of the selection, each after the steps that it `follows`."""
     return [selection.step(kind) for kind in all_steps()]
 
 
@@ -75,10 +77,10 @@ def geometry_steps(selection: Selection) -> list[GeometryStep]:
 
 
 def steps_of(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
-    """All steps with these values of their options, keyed as in `key_of`.
+    """All steps with these values of their options. The keys are those of `key_of`.
 
     Raises:
-        ValueError: options of a step that exclude each other.
+        ValueError: options of a step exclude each other.
     """
     return tuple(
         step(**{field: values[key_of(option.name)] for field, option in options_of(step).items()})
@@ -87,7 +89,7 @@ def steps_of(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
 
 
 def recorded(steps: Sequence[PrepStep], done: Mapping[str, StepDone]) -> dict[str, Value]:
-    """What a volume's file records of the steps, by name."""
+    """What the file of a volume records about the steps, by name."""
     records: dict[str, Value] = {}
     options = {step.name: _options(step) for step in steps}
     for name in {**options, **done}:

@@ -1,4 +1,6 @@
-"""Replay: runs the monitor's checks over the frames of a file, of any format, finished or growing."""
+"""Replay: runs the checks of the monitor over the frames of a file. The file may have any format and may still be
+growing.
+"""
 
 from __future__ import annotations
 
@@ -27,9 +29,9 @@ class SkippedChecks:
 
     Attributes:
         views: number of exposed projections.
-        alone: projections that were not compared with earlier ones.
-        without_flats, cones, wider: projections of a scan without flats, of a cone beam, of a sample wider than the
-            field of view.
+        alone: number of projections that were not compared with earlier projections.
+        without_flats, cones, wider: numbers of projections for which checks were skipped because the scan has no flats,
+            because the beam is a cone, or because the sample is wider than the field of view.
     """
 
     views: int = 0
@@ -39,7 +41,7 @@ class SkippedChecks:
     wider: int = 0
 
     def with_frame(self, context: ScanContext) -> SkippedChecks:
-        """The counts after the next frame; `context` is what the checks knew about it."""
+        """The counts after the next frame. `context` contains what the checks knew about this frame."""
         if context.view is None or context.grid is None:
             return self
         return SkippedChecks(
@@ -51,8 +53,8 @@ class SkippedChecks:
         )
 
     def in_words(self) -> tuple[str, ...]:
-        """The skipped checks, the number of projections and the reason, one text each. First projections, which have
-        no predecessors, count only if all projections do.
+        """The skipped checks, each as a text with the number of projections and the reason. The first projections have
+        no predecessors; they are mentioned only if this is true for all projections.
         """
         alone = self.alone if self.alone > min(SPAN, self.views - 1) else 0
         reasons = (
@@ -69,12 +71,12 @@ class FrameVerdict:
     """The flags of a frame, and the state of the checks after it.
 
     Attributes:
-        row: of the frame, in the file.
-        kind: of the frame.
-        flags: what the checks found.
-        n: frames in the file so far.
-        aside: for how many projections each check was skipped so far.
-        failures: a sentence on each check that failed with an error at this frame and is off from here on.
+        row: row of the frame in the file.
+        kind: kind of the frame.
+        flags: flags of the checks.
+        n: number of frames in the file so far.
+        aside: number of projections for which each check was skipped so far.
+        failures: a sentence for each check that failed with an error at this frame. The check is not used from then on.
     """
 
     row: int
@@ -109,9 +111,9 @@ class ScanVerdict:
         kinds: the flags by check and level, the worst level first.
         alarmed: numbers of the frames with an alarm, without those that were taken again.
         retaken: numbers of the projections that were taken again.
-        references: what is wrong with darks and flats, a text for each group.
-        altered: a sentence on what in the file differs from its stored checksums; "" if nothing differs.
-        aside: which checks skipped how many projections, and which checks failed with an error.
+        references: faults of darks and flats, a text for each group.
+        altered: a sentence that says which data in the file do not match their checksums; "" if all data match.
+        aside: texts that say which checks skipped how many projections, and which checks failed with an error.
     """
 
     n_frames: int
@@ -142,15 +144,15 @@ def replay(
 ) -> Iterator[FrameVerdict]:
     """Check every frame, in the order of the file.
 
-    Frames of line integrals are checked as counts of a beam without noise; unknown exposures count as equal.
+    Line integrals are converted to counts of a beam without noise and then checked. Unknown exposures count as equal.
 
     Args:
-        follow: the clock to wait with for further frames, until the file is finished; None: check the frames that
-            are present.
+        follow: clock for waiting for further frames until the file is finished; None: only the frames that are already
+            in the file are checked.
         should_stop: function that is called before each frame; True ends the replay.
 
     Raises:
-        DataError: a followed file that stopped growing before it was finished.
+        DataError: the file stopped growing before it was finished (only with `follow`).
     """
     monitor, aside = start(context_of(source), checks), SkippedChecks()
     for frame, n in frames_of(source, follow=follow, should_stop=should_stop):
@@ -161,21 +163,21 @@ def replay(
 
 
 def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: ReferenceLimits | None = None) -> ScanVerdict:
-    """The verdict on the frames, together with the faults of darks, flats and the file.
+    """The verdict about the frames, together with the faults of darks, flats and the file.
 
     Args:
         limits: limits for darks and flats; None: the default limits.
     """
     flags = [flag for each in judged for flag in each.flags]
     again = frozenset(source.table.replaced.tolist())
-    found = ScanEvidence(source, EvidenceRequest(limits=limits)).findings
+    findings = ScanEvidence(source, EvidenceRequest(limits=limits)).findings
     failures = tuple(failure for each in judged for failure in each.failures)
     return ScanVerdict(
         n_frames=len(judged),
         kinds=by_kind(flags),
         alarmed=tuple(sorted({n for flag in flags if flag.level is Level.ALARM for n in flag.frames} - again)),
         retaken=tuple(sorted(again)),
-        references=tuple(finding.message for finding in found if finding.frames),
+        references=tuple(finding.message for finding in findings if finding.frames),
         altered=altered_sentence(source) if source.table.altered.any() else "",
         aside=failures + (judged[-1].aside.in_words() if judged else ()),
     )

@@ -1,5 +1,5 @@
-"""Frames of a file, finished or growing, in the form in which the monitor gets them from a camera; and the facts of
-the scan that the checks need.
+"""Reads the frames of a file in the form in which the monitor gets them from a camera. The file may still be growing.
+Also collects the facts about the scan that the checks need.
 """
 
 from __future__ import annotations
@@ -28,19 +28,20 @@ from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
 from recon.base.views import spread
 
-BEAM = 50_000.0  # counts that represent a transmission of 1 if a file holds line integrals
+BEAM = 50_000.0  # counts that stand for a transmission of 1 if a file contains line integrals
 SAMPLES = 4  # frames of each kind in which the saturation level of the detector is searched for
-# fraction of the pixels at the largest count, from which on this count is the end of the detector's range
+# if at least this fraction of the pixels has the largest count, this count is the end of the detector's range
 PILED_UP = 1e-3
-POLL = 0.1  # s between two reads of a growing file
+POLL = 0.1  # s between two looks at a growing file
 
 
 def frames_of(
     source: ScanSource, *, follow: Clock | None = None, should_stop: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[Frame, int]]:
-    """Every frame, in the order of the file, and how many the file has so far; arguments and errors: see `replay`.
+    """Yields every frame in the order of the file, and the number of frames in the file so far. Arguments and errors
+    are those of `replay`.
 
-    A projection that was taken again later has the kind that it had when it arrived.
+    If a projection was taken again later, the first attempt has the kind that it had when it arrived.
     """
     done = 0
     for n in growing(source, follow) if follow is not None else (source.refresh(),):
@@ -48,7 +49,7 @@ def frames_of(
         for frame in _frames(source, done):
             if should_stop():
                 return
-            if frame.index in again:  # as the monitor saw the frame before it was taken again
+            if frame.index in again:  # as the monitor saw the frame, before the frame was taken again
                 frame = replace(frame, kind=FrameKind.PROJECTION)
             yield frame, n
         done = n
@@ -60,7 +61,7 @@ def awaited(
     """The scan that begins at `path`, as soon as its file can be read.
 
     Raises:
-        DataError: none begins within `patience` s.
+        DataError: no scan begins within `patience` s.
     """
     last = clock.now() + patience
     while True:
@@ -73,14 +74,14 @@ def awaited(
 
 
 def growing(source: ScanSource, clock: Clock, patience: float = PATIENCE, poll: float = POLL) -> Iterator[int]:
-    """Number of frames in a file at each read, until it is finished.
+    """Yields the number of frames in a file at each look, until the file is finished.
 
     Raises:
-        DataError: it stopped growing before it was finished.
+        DataError: the file stopped growing before it was finished.
     """
     writer, n, ended = WriterWatch(source.path, clock.now(), patience), 0, False
     while not ended:
-        ended = source.finished  # asked before the number of frames, so that no frame can arrive in between
+        ended = source.finished  # read before the number of frames, so that no frame can arrive in between
         before, n = n, source.refresh()
         yield n
         if not ended and (why := writer.lost(clock.now(), n > before, lambda: source.finished)):
@@ -92,7 +93,7 @@ def growing(source: ScanSource, clock: Clock, patience: float = PATIENCE, poll: 
 def context_of(source: ScanSource) -> ScanContext:
     """The facts about a file that the checks need before its first frame.
 
-    The period is known only of fly scans that this program took.
+    The period is known only for fly scans that this program took.
     """
     rows, cols = source.shape
     fly = source.plan.get("mode") == "fly"
@@ -108,8 +109,8 @@ def context_of(source: ScanSource) -> ScanContext:
 
 
 def _step(source: ScanSource) -> float:
-    """Radians between two projections, from the plan of a scan that this program took, or else from the angles in
-    the file.
+    """Angle in radians between two projections, from the plan if this program took the scan, otherwise from the angles
+    in the file.
     """
     planned = source.plan.get("angles_deg")
     if isinstance(planned, list) and all(isinstance(angle, int | float) for angle in planned):
@@ -118,8 +119,8 @@ def _step(source: ScanSource) -> float:
 
 
 def _saturation(source: ScanSource) -> float:
-    """Saturation as the file states it; otherwise the end of the pixels' type, or of fewer bits if many pixels have
-    the largest count. Inf if pixels are real numbers.
+    """The saturation level that the file states. Otherwise the largest value of the pixels' type, or of fewer bits if
+    many pixels have the largest count. Inf if the pixels are real numbers.
     """
     if source.quantity == "line_integrals" or source.dtype.kind not in "ui":
         return np.inf
@@ -137,8 +138,8 @@ def _saturation(source: ScanSource) -> float:
 
 
 def _frames(source: ScanSource, first: int) -> Iterator[Frame]:
-    """Frames from `first` on: counts as they are, line integrals as counts of a beam. An angle that no stage reaches
-    becomes NaN. An unknown exposure becomes 1 s, so that projections and flats agree.
+    """Yields the frames from `first` on. Counts are unchanged; line integrals become counts of a beam. An angle that no
+    stage reaches becomes NaN. An unknown exposure becomes 1 s, so that projections and flats agree.
     """
     for frame in source.frames(first):
         pixels: NDArray[Any] = frame.counts
@@ -153,8 +154,8 @@ def _frames(source: ScanSource, first: int) -> Iterator[Frame]:
 
 
 def _type_of_kernels(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """The type that holds such pixels for compiled kernels, which support neither foreign byte orders nor floats of
-    16 or more than 64 bits.
+    """The type to which pixels are converted for compiled kernels. These support neither foreign byte orders nor floats
+    of 16 bits or of more than 64 bits.
     """
     if dtype.kind == "f" and dtype.itemsize not in (4, 8):
         return np.dtype(np.float32 if dtype.itemsize == 2 else np.float64)

@@ -1,4 +1,4 @@
-"""Statistics of the pixel values of a scan as stored, by kind of frame, before any correction."""
+"""Statistics of the stored pixel values of a scan, by kind of frame, before any correction."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from recon.prep.matter import absorbed_dose
 
 FRAMES = 64  # Frames of each kind that are examined, evenly spread.
 PERCENT = (0.1, 1.0, 50.0, 99.0, 99.9)
-_BINS = 2**16  # between the least and the greatest value of real numbers; integers have one bin each
+_BINS = 2**16  # number of bins between the smallest and the largest real number; integers have one bin each
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +27,11 @@ class KindStatistics:
 
     Attributes:
         frames: number of frames that were examined, out of `of` frames.
-        minimum, maximum, mean, deviation: of all their finite pixels.
-        percentiles: percentiles at PERCENT, exact to one count, or, for real numbers, to 1/65536 of their range.
+        minimum, maximum, mean, deviation: statistics of all finite pixels of these frames.
+        percentiles: percentiles at PERCENT, exact to one count; for real numbers, to 1/65536 of their range.
         saturated: fraction of the pixels that have the largest value of their type; 0 for real numbers.
         not_finite: fraction of the pixels that are not finite.
-        absolute: sum of the absolute values of a frame, mean over frames.
+        absolute: sum of the absolute pixel values of a frame, mean over the frames.
         edges, pixels: the histogram.
     """
 
@@ -76,7 +76,9 @@ def statistics_of(
 def _of_kind(
     kind: FrameKind, rows: NDArray[np.intp], of: int, image: Callable[[int], NDArray[Any]], dtype: np.dtype[Any]
 ) -> KindStatistics:
-    """Two passes: range, then histogram and moments about a value in the range."""
+    """Statistics from two passes over the frames. The first pass finds the range; the second makes the histogram, and
+    moments about a value in the range.
+    """
     low, high, finite, whole = np.inf, -np.inf, 0, 0
     for row in map(int, rows):
         values = image(row)
@@ -106,19 +108,19 @@ def _of_kind(
         absolute += float(np.abs(away + low).sum()) / rows.size
     mean = total / finite
     below = np.cumsum(pixels)
-    at = np.searchsorted(below, np.array(PERCENT) / 100 * finite)
+    bins = np.searchsorted(below, np.array(PERCENT) / 100 * finite)
     middles = (edges[1:] + edges[:-1]) / 2
     full = float(np.iinfo(dtype).max) if dtype.kind in "iu" else np.inf
     return KindStatistics(
         kind, rows.size, of, low, high, low + mean, float(np.sqrt(max(squares / finite - mean**2, 0.0))),
-        tuple(float(middles[i]) for i in at), float(pixels[-1] / finite) if high == full else 0.0, 1 - finite / whole,
+        tuple(float(middles[i]) for i in bins), float(pixels[-1] / finite) if high == full else 0.0, 1 - finite / whole,
         edges, pixels, absolute,
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class LightAsked:
-    """What the user states about the intensity: photons per count, and the material for the dose.
+    """What the user states for the intensity and the dose: photons per count, and a material.
 
     Attributes:
         photons_per_count: X-ray photons at the sample per count.
@@ -166,9 +168,9 @@ class Light:
 
     Attributes:
         views: number of projections of the scan.
-        photons: per pixel and projection, in the open beam at the sample.
-        gray: dose at the surface of the sample per projection; None: not asked for.
-        material: the absorbing material and the energy, in words.
+        photons: photons per pixel and projection in the open beam at the sample.
+        gray: dose in Gy at the surface of the sample per projection; None: not requested.
+        material: a text with the absorbing material and the energy.
     """
 
     views: int
@@ -198,7 +200,7 @@ def light_of(source: ScanSource, statistics: list[KindStatistics], asked: LightA
     photons = (mean[FrameKind.FLAT] - mean[FrameKind.DARK]) * asked.photons_per_count
     seconds = (source.table.exposures[source.table.of_kind(kind)] for kind in (FrameKind.PROJECTION, FrameKind.FLAT))
     known = [each[np.isfinite(each)] for each in seconds]
-    if all(each.size for each in known):  # otherwise one exposure time is assumed for all
+    if all(each.size for each in known):  # otherwise all frames are assumed to have the same exposure
         photons *= float(known[0].mean() / known[1].mean())
     photons *= source.frames_per_view
     views = source.table.views.size

@@ -1,4 +1,4 @@
-"""Warnings before a reconstruction: unusual units, a rotation axis that differs from that of the poses, a sample
+"""Warnings before a reconstruction: unusual units, a rotation axis that differs from the axis of the poses, a sample
 wider than the field of view, missing and repaired pixels.
 """
 
@@ -28,10 +28,10 @@ _SAME_AXIS = 0.05  # columns
 
 
 def warn_of_units(scan: SelectedScan, warn: Warn) -> None:
-    """Warn of a pixel size, an energy or a distance that no instrument has, probably because of a wrong unit."""
+    """Warn of a pixel size, an energy or a distance that no instrument has. The cause is probably a wrong unit."""
     source, selection, size_mm = scan.source, scan.selection, scan.selection.pixel_size_mm
     stated = [("pixel_size_um", None if size_mm is None else size_mm * 1e3), ("energy_kev", source.energy_kev)]
-    for step in in_order(selection):  # options of the same names
+    for step in in_order(selection):  # the options have the same names
         stated += [(name, getattr(step, name, None)) for name in ("pixel_size_um", "energy_kev", "distance_mm")]
     for sentence in dict.fromkeys(doubt(name, value) for name, value in stated):
         if sentence:
@@ -58,8 +58,8 @@ def warn_of_other_axis(poses: ScanPoses | None, selection: ScanSelection, axis_c
 
 
 def warn_of_the_field(scan: SelectedScan, prepared: PreparedProjections, warn: Warn) -> None:
-    """Warn of a sample beyond the field of view. If no air corrects the intensity, also warn of its changes and of
-    the ring current.
+    """Warn of a sample that extends beyond the field of view. If no air is available to correct the intensity, also
+    warn of changes of the intensity and of the ring current.
     """
     geometry, edges = prepared.geometry, reach_of(prepared.seen).edges
     unlevelled = not any(prepared.corrected.air_columns)
@@ -81,8 +81,8 @@ def cut_sentence(sides: dict[str, float], continued: bool, wide: bool) -> str:
 
     Args:
         sides: see `FieldEdges.beyond`.
-        continued: FBP extrapolates the projections.
-        wide: the scan has laterally offset projections.
+        continued: True if FBP extrapolates the projections.
+        wide: True if the scan has laterally offset projections.
     """
     fbp = (
         "FBP extrapolates the projections beyond the detector, and densities are off by tens of per cent. The other"
@@ -102,7 +102,7 @@ def cut_sentence(sides: dict[str, float], continued: bool, wide: bool) -> str:
 
 
 def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str:
-    """The warning for a sample that is inside the field of view in some projections only, see `FieldEdges.passing`."""
+    """The warning for a sample that is inside the field of view only in some projections, see `FieldEdges.passing`."""
     words = " and ".join(
         f"at the {side} edge in projections {first} to {last}" for side, (first, last) in ranges.items()
     )
@@ -115,8 +115,8 @@ def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str
 
 
 def report_defects(prepared: PreparedProjections, first_row: int, binning: int, warn: Warn) -> None:
-    """Report slices (of a cone beam: detector rows) that no ray measured, pixels without data, zingers that remain,
-    and repaired pixels if they are more than one in a thousand.
+    """Report slices (for a cone beam: detector rows) that no ray measured, pixels without data, and zingers that
+    remain. Repaired pixels are reported if more than one in a thousand was repaired.
 
     Args:
         first_row: row of the detector at which the (binned) rows begin.

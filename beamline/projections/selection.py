@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound=NamedStep)
 
-_PIXEL_SIZES_UM = 1e-6, 1e6  # far beyond any detector's on either side
+_PIXEL_SIZES_UM = 1e-6, 1e6  # limits far beyond any detector
 
 
 @dataclass(frozen=True)
@@ -61,16 +61,19 @@ class Selection:
 
     def __post_init__(self) -> None:
         check_settings(self)
-        for name in ("rows", "cone", "axis_rows"):  # a pair from a list or an array must equal the same pair as a tuple
+        # a pair from a list or an array must equal the same pair given as a tuple
+        for name in ("rows", "cone", "axis_rows"):
             if (pair := getattr(self, name)) is not None:
                 object.__setattr__(self, name, tuple(getattr(pair, "tolist", lambda pair=pair: pair)()))
 
     def step(self, kind: type[S]) -> S:
-        """The step of the class `kind` in this selection; if there is none, a new step with default settings."""
+        """The correction step of the class `kind`. If the selection does not contain such a step, a new step with
+        default settings.
+        """
         return next((step for step in self.steps if isinstance(step, kind)), None) or kind()
 
     def with_steps(self, *steps: NamedStep) -> Self:
-        """The same selection with these steps; each replaces the step of the same class."""
+        """The same selection with these correction steps. Each step replaces the step of the same class."""
         kinds = {type(step) for step in steps}
         return replace(self, steps=(*(step for step in self.steps if type(step) not in kinds), *steps))
 
@@ -101,14 +104,14 @@ class Selection:
 
 @dataclass(frozen=True, kw_only=True)
 class ScanSelection(Selection):
-    """What is selected of one scan; pixel size, cone and width of the sample are the file's unless the selection
-    states them.
+    """A selection applied to one scan. Pixel size, cone and sample width are the values in the file unless the
+    selection states them.
 
     Attributes:
-        rows: those that are read, whole bins.
-        asked: the selection of the user.
+        rows: the rows that are read; whole bins.
+        asked: the selection that the user gave.
         shape: (height, width) of the detector.
-        path: of the file.
+        path: path of the file.
     """
 
     asked: Selection
@@ -142,11 +145,12 @@ class ScanSelection(Selection):
         return ((self.shape[0] - 1) / 2 - self.detector_rows.start - (self.binning - 1) / 2) / self.binning
 
     def geometry(self, axis_col: float, angles: NDArray[np.float64]) -> Geometry:
-        """Geometry of projections at `angles` in the rows and with the binning; pitch 1 if it is unknown.
+        """Geometry of projections at `angles` with the selected rows and binning. The pitch is 1 if the pixel size is
+        unknown.
 
         Raises:
-            ConfigError: a cone beam has no known pixel size, or impossible distances; a central row of a parallel
-                beam.
+            ConfigError: for a cone beam, the pixel size is unknown or the distances are impossible; or a central row
+                was given for a parallel beam.
         """
         rows, pitch = self.detector_rows, self.pixel_size_mm
         full = (rows.stop - rows.start, self.shape[1])
@@ -156,7 +160,7 @@ class ScanSelection(Selection):
                     f"Give --pixel-size-um (on the detector): a cone beam needs it, and {self.path} does "
                     "not state its pixel size."
                 )
-            # The central ray meets the same detector row, whatever rows are read.
+            # The central ray meets the same detector row whatever rows are read.
             meets = (self.shape[0] - 1) / 2 if self.central_row is None else self.central_row
             try:
                 if self.cone[1] < (width := full[1] * pitch) / math.sqrt(2):
@@ -178,11 +182,11 @@ class ScanSelection(Selection):
 
 @dataclass(frozen=True, eq=False)
 class SelectedScan:
-    """A scan and what is selected of it, made once per job by `beamline.projections.views.select`.
+    """A scan and its selection. `beamline.projections.views.select` makes it once per job.
 
     Attributes:
-        evidence: what darks, flats and some projections of the scan show.
-        selection: of this scan.
+        evidence: facts that darks, flats and some projections of the scan show.
+        selection: the selection applied to this scan.
     """
 
     evidence: ScanEvidence
@@ -195,19 +199,19 @@ class SelectedScan:
 
     @property
     def table(self) -> FrameTable:
-        """What each frame was when the evidence was taken."""
+        """The table of the frames at the time when the evidence was created."""
         return self.evidence.table
 
     def part(self, **changes: Any) -> SelectedScan:
-        """The same scan with another selection: fields of it by name."""
+        """The same scan with another selection. The arguments are fields of the selection."""
         return replace(self, selection=replace(self.selection, **changes))
 
     def with_steps(self, *steps: NamedStep) -> SelectedScan:
-        """The same scan with these steps; each replaces the step of the same class."""
+        """The same scan with these correction steps. Each step replaces the step of the same class."""
         return replace(self, selection=self.selection.with_steps(*steps))
 
     def selecting(self, selection: Selection) -> SelectedScan:
-        """The same scan with another selection of the user, whose settings of references and flags are the same.
+        """The same scan with another selection from the user. Its settings for references and flags must be the same.
 
         Raises:
             ConfigError: as `Selection.of`.
@@ -215,12 +219,12 @@ class SelectedScan:
         return replace(self, selection=selection.of(self.source))
 
     def renewed(self) -> SelectedScan:
-        """The scan with the frames that are recorded by now."""
+        """The scan with all frames that have been recorded until now."""
         return replace(self, evidence=self.evidence.renewed())
 
 
 def choose_views(scan: SelectedScan, frames: NDArray[np.int64], period: float = math.pi) -> NDArray[np.int64]:
-    """Rows in `frames` of the projections that the selection names; at least two.
+    """The rows among `frames` of the projections that the selection names; at least two.
 
     Args:
         period: radians after which projections measure the same rays, see `Geometry.period`.
@@ -254,6 +258,6 @@ def unbinned(column: float, binning: int) -> float:
 
 def with_pivot(geometry: Geometry, pivot: float) -> Geometry:
     """The geometry whose projections roll and tilt about the row `pivot`."""
-    # In a parallel beam z = 0 is the middle of the rows used, but these projections roll and tilt about the detector's
-    # middle.
+    # In a parallel beam z = 0 is the middle of the rows used, but these projections roll and tilt about the middle of
+    # the detector.
     return geometry if geometry.is_straight or geometry.is_cone else replace(geometry, axis_row=pivot)

@@ -1,6 +1,7 @@
-"""A correction step: its options, its name, the memory it needs, and the record of what it did.
+"""Base of a correction step: options, name, memory, and the record of what the step did.
 
-A step is a frozen dataclass. A field made by `option` is an option of the commands, of a recipe and of Python alike.
+A step is a frozen dataclass. A field made by `option` is an option in three places: on the command line, in a recipe,
+and in Python.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class NamedStep(Protocol):
-    """What a selection knows about a step; its abilities are the protocols in `beamline.projections.protocols`.
+    """The part of a step that a selection uses. The protocols in `beamline.projections.protocols` describe what a step
+    can do.
 
     Attributes:
-        name: of the step in events, and its key in `PreparedProjections.done`.
+        name: name of the step in events, and its key in `PreparedProjections.done`.
         follows: names of steps that come before it.
     """
 
@@ -32,13 +34,13 @@ class Option:
     """An option of a step on the command line.
 
     Attributes:
-        name: with its dashes.
-        help: for the user.
-        default: as it would be typed; None: there is nothing to type.
-        parse: converts the typed text to the value of the field; its ValueError is bad usage.
+        name: name of the option, including the dashes.
+        help: help text for the user.
+        default: the default as one would type it; None: the default is to leave the option out.
+        parse: function that converts the typed text to the value of the field. A ValueError means wrong usage.
         choices: what may be typed; empty: anything that `parse` accepts.
         metavar: placeholder of the value in help.
-        path: it names a file.
+        path: True if the value is the name of a file.
     """
 
     name: str
@@ -51,11 +53,11 @@ class Option:
 
 
 def option(name: str, default: str | None, help: str, **rest: Any) -> Any:
-    """A field of a step that the option `name` sets; `rest`: the other attributes of `Option`. Field and option
-    share the default.
+    """A field of a step that the option `name` sets. `rest` are the other attributes of `Option`. Field and option have
+    the same default.
     """
-    made = Option(name, help, default, **rest)
-    return field(default=None if default is None else made.parse(default), metadata={"option": made})
+    description = Option(name, help, default, **rest)
+    return field(default=None if default is None else description.parse(default), metadata={"option": description})
 
 
 def options_of(step: type[NamedStep]) -> dict[str, Option]:
@@ -82,8 +84,9 @@ class StepDone:
 
     Attributes:
         sentence: a sentence for the user; empty if nothing was requested or found.
-        parameters: what the file of the volume records of it, by name; None: the step's options, and `said`.
-        warned: the sentence was already given as a warning.
+        parameters: what the file of the volume records about the step, by name; None: the options of the step, and
+            `said`.
+        warned: True if the sentence was already given as a warning.
     """
 
     sentence: str = ""
@@ -96,8 +99,8 @@ class StepMemory:
     """Peak memory of a step in bytes, in addition to raw pixels, line integrals and volume.
 
     Attributes:
-        correcting: while projections are corrected, a batch at a time.
-        alone: before or after that.
+        correcting: memory while projections are corrected, one batch at a time.
+        alone: memory before or after the correction.
     """
 
     correcting: int = 0

@@ -1,4 +1,6 @@
-"""In-plane tilt of the rotation axis, measured in corrected projections, and the warning if nobody stated it."""
+"""Measures the in-plane tilt of the rotation axis in corrected projections, and warns of it if the user did not state
+it.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +18,9 @@ from recon.prep.axis_wedge import FEWEST_BANDS
 from recon.prep.tilt import TiltEstimate, find_tilt
 
 MATTERS = 0.5
-"""Pixels over the rows from which a tilt doubles edges."""
+"""A tilt by this many pixels over all rows doubles edges visibly."""
 _BANDS, _BAND_ROWS, _VIEWS = 8, 2, 90  # bands of rows, rows of each, and projections that the warning is based on
-_FEWEST_ROWS = 32  # half a pixel over fewer rows is not a tilt of a stage
+_FEWEST_ROWS = 32  # half a pixel over fewer rows would be a larger tilt than a stage has
 _SURE = 3.0  # standard deviations from which a tilt is significant
 BandsDone = Callable[[int, int], None]  # (n, N): n bands of rows of N are corrected
 
@@ -36,7 +38,7 @@ def warn_of_tilt(plan: ScanCorrectionPlan, frames: NDArray[np.int64], warn: Warn
     try:
         shown = shown_tilt(plan, frames, (_BANDS, _BAND_ROWS), progress, warn)
     except (ValueError, DataError):
-        return  # the tilt could not be measured, and nobody asked for it
+        return  # the tilt could not be measured, and the user did not ask for it
     if abs(shown.tilt) * rows > MATTERS and abs(shown.tilt) > _SURE * shown.uncertainty:
         warn(
             "Give --tilt auto (or --tilt 0 if the axis is straight): the rotation axis seems to be "
@@ -53,10 +55,10 @@ def shown_tilt(
     progress: BandsDone,
     warn: Warn | None = None,
 ) -> TiltEstimate:
-    """The tilt measured in corrected projections, from the bands of rows that can be corrected.
+    """The tilt, measured in corrected projections from the bands of rows that can be corrected.
 
     Args:
-        size: number of bands, and rows of each.
+        size: number of bands, and number of rows of each band.
         warn: as in `apply`.
 
     Raises:
@@ -72,7 +74,7 @@ def shown_tilt(
         try:
             band = apply(plan, frames, slice(first, first + height), warn)
         except DataError:
-            continue  # no beam in these rows
+            continue  # there is no beam in these rows
         if not means:
             ids = band.view_ids
         if np.array_equal(band.view_ids, ids):
@@ -85,7 +87,7 @@ def shown_tilt(
 
 
 def tilt_text(tilt: float, uncertainty: float) -> str:
-    """Degrees with their uncertainty, rounded to its digits."""
+    """Text with the angle in degrees and its uncertainty, rounded to the digits of the uncertainty."""
     sigma = math.degrees(uncertainty)
     digits = min(max(1 - math.floor(math.log10(max(sigma, 1e-4))), 2), 4)
     return f"{math.degrees(tilt):.{digits}f} ± {sigma:.{digits}f} degrees"

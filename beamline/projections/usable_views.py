@@ -1,4 +1,6 @@
-"""Usable projections of a scan: which remain, and the weights of projections and of regions in them."""
+"""Usable projections of a scan: selects the projections that can be used, with weights of projections and of regions in
+them.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ class Regions:
         frames: int64 [region], rows of the file.
         boxes: int64 [region, 4], first row, row after the last, first column, column after the last.
         shares: float32 [region], the weight of the rays in it.
-        resampling: of the projections, whose pixels move by it; None: no resampling.
+        resampling: resampling of the projections, which moves their pixels; None: projections are not resampled.
     """
 
     frames: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -36,11 +38,11 @@ class Regions:
     resampling: Resampling | None = None
 
     def mark(self, view_ids: I64) -> bool:
-        """Mark which rays of these projections have reduced weight."""
+        """True if any of these projections has rays with reduced weight."""
         return bool(np.isin(self.frames, view_ids).any())
 
     def and_unmeasured(self, runs: I64, first_row: int, binning: int) -> Regions:
-        """These regions, and the runs of `Projections.unmeasured`, rays of weight 0.
+        """These regions, and the runs in `Projections.unmeasured`, whose rays have weight 0.
 
         Args:
             first_row: detector row at which the binned rows of the runs begin.
@@ -53,7 +55,7 @@ class Regions:
     def weights(self, view_ids: I64, rows: slice, binning: int, shape: tuple[int, int]) -> NDArray[np.float32] | None:
         """[view, row, col] weights of the rays of some projections, in binned pixels `shape` of these detector rows.
 
-        None if all are 1.
+        None if all weights are 1.
         """
         chosen = np.isin(self.frames, view_ids)
         if not chosen.any():
@@ -61,22 +63,22 @@ class Regions:
         height, width = shape
         weights = np.ones((view_ids.size, height, width), np.float32)
         seen = None if self.resampling is None else self.resampling.places(shape, rows.start)
-        at = {int(frame): view for view, frame in enumerate(view_ids)}
+        view_of = {int(frame): view for view, frame in enumerate(view_ids)}
         for frame, (top, bottom, left, right), share in zip(
             self.frames[chosen].tolist(), self.boxes[chosen].tolist(), self.shares[chosen].tolist(), strict=True
         ):
             if seen is not None:
                 row, col = seen
                 inside = (row > top - 1) & (row < bottom) & (col > left - 1) & (col < right)
-                weights[at[frame]][inside] *= share
+                weights[view_of[frame]][inside] *= share
                 continue
             first, end = max(top - rows.start, 0), max(bottom - rows.start, 0)
             if not any(edge % binning for edge in (first, end, left, right)):
-                weights[at[frame], first // binning : end // binning, left // binning : right // binning] *= share
+                weights[view_of[frame], first // binning : end // binning, left // binning : right // binning] *= share
                 continue
             fine = np.ones((1, height * binning, width * binning), np.float32)
             fine[0, first:end, left:right] = share
-            weights[at[frame]] *= bin_views(fine, binning)[0]
+            weights[view_of[frame]] *= bin_views(fine, binning)[0]
         return weights
 
 
@@ -87,12 +89,13 @@ class UsableViews:
     Attributes:
         scan: the evidence on which the choice is based.
         frames: int64 [view], their rows in the file.
-        weights: float32 [frame of the file], of each row that is a projection; None: 1 for all.
-        left_out: projections with an alarm, which are not among them.
-        sentence: what was done, in a line; empty if no projection is flagged.
-        flags: of all frames, from which the other fields follow unless they are ignored; None: the file has none.
-        regions: parts of projections with less weight, in projections that are used otherwise.
-        jumps: int64, ascending, rows after which the sample had another position according to the monitor.
+        weights: float32 [frame of the file], weight of each projection; None: 1 for all.
+        left_out: projections with an alarm, which are not among `frames`.
+        sentence: a sentence that says what was done; empty if no projection is flagged.
+        flags: flags of all frames; the other fields follow from them unless flags are ignored. None: the file has no
+            flags.
+        regions: regions with less weight, in projections that are used.
+        jumps: int64, ascending, rows from which on the sample had another position according to the monitor.
     """
 
     scan: ScanEvidence
@@ -118,15 +121,19 @@ class UsableViews:
 WARNED_SHARE = 0.5
 """Weight of a ray in the region of a warning."""
 WARNED_WEIGHT = 0.5
-"""Weight of a view with a warning: as if its noise had twice the variance. A warning says that the view differs by more
-than noise, not that it is wrong, and there are too few views to do without it."""
+"""Weight of a projection with a warning, as if its noise had twice the variance. A warning says that the projection
+differs by more than noise, but not that it is wrong, and there are too few projections to leave it out.
+"""
 WIDE = 2.5
-"""A gap between the remaining views is reported when it is this many times the widest gap before: two neighbouring
-views are missing."""
+"""A gap between the remaining projections is reported if it is larger than the widest gap before by this factor,
+because then two neighbouring projections are missing.
+"""
 
 
 def usable_views(scan: ScanEvidence, use_flags: bool) -> UsableViews:
-    """Projections without an alarm and their weights; all with equal weights if `use_flags` is False."""
+    """The projections without an alarm, with their weights. If `use_flags` is False: all projections with equal
+    weights.
+    """
     from beamline.storage.rules.flag_policy import flag_policy
 
     views, flags = scan.table.are_views, scan.flags
@@ -159,7 +166,7 @@ def gap_sentence(scan: ScanEvidence | ScanSource, before: NDArray[np.int64], aft
 
 
 def _widest_gap(angles: NDArray[np.float64], period: float) -> float:
-    """Radians between the neighbouring projections that are furthest apart; projections a `period` apart measure the
+    """The largest angle in radians between neighbouring projections. Projections that are a `period` apart measure the
     same rays.
     """
     sorted_angles = np.sort(np.mod(angles[np.isfinite(angles)], period))
@@ -167,13 +174,13 @@ def _widest_gap(angles: NDArray[np.float64], period: float) -> float:
 
 
 def regions_of(treated: FlagPolicy) -> Regions:
-    """The regions of warnings and alarms in frames; rays in an alarm region have weight 0."""
+    """The regions of warnings and alarms in frames. Rays in the region of an alarm have weight 0."""
     frames, boxes, alarms = zip(*treated.parts, strict=True) if treated.parts else ((), (), ())
     shares = np.where(np.array(alarms, np.bool_), np.float32(0), np.float32(WARNED_SHARE))
     return Regions(np.array(frames, np.int64), np.array(boxes, np.int64).reshape(-1, 4), shares)
 
 
 def longest_part(frames: I64, jumps: I64) -> I64:
-    """The rows of the largest part between jumps, which ascend."""
+    """The rows of the largest part between jumps. `jumps` are in ascending order."""
     parts = np.searchsorted(jumps, frames, side="right")
     return frames[parts == np.bincount(parts).argmax()] if frames.size else frames

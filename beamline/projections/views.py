@@ -1,4 +1,4 @@
-"""The projections of a scan: which may be used, and their geometry as stated and as corrections change it."""
+"""Determines the usable projections of a scan and their geometry, as it is stated and as corrections change it."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ from recon.base.geometry import Geometry
 
 
 def stated_geometry(scan: SelectedScan) -> Geometry:
-    """The geometry of the selected projections, as scan and options state it, before any frame is read.
+    """The geometry of the selected projections that the scan and the options state, before any frame is read.
 
-    An axis that is to be found is assumed in the middle; projections without an angle or a pose are left out.
+    If the axis must still be found, it is assumed to be in the middle. Projections without an angle or a pose are left
+    out.
 
     Raises:
         ConfigError: the selection does not fit the scan.
@@ -54,11 +55,11 @@ def stated_geometry(scan: SelectedScan) -> Geometry:
 
 @dataclass(eq=False)
 class ViewGeometry:
-    """The geometry of projections: stated angles, and what the steps find and change.
+    """The geometry of projections, from the stated angles and from what the steps find and change.
 
     Attributes:
         stated_axis: the column of the rotation axis before calibration.
-        moved: where the sample was in the projections, by the name of the step that found it.
+        moved: position of the sample in the projections, by the name of the step that found it.
         width: what was done about the width of rays.
         learnt: what was calibrated, by the name of the step.
     """
@@ -81,7 +82,7 @@ class ViewGeometry:
         return {**{name: motion.done for name, motion in self.moved.items()}, Width.name: self.width, **calibrated}
 
     def find_motion(self, usable: UsableViews, warn: Warn, phases: Phases) -> UsableViews:
-        """Let each step find the sample position; returns the `usable` projections that remain usable."""
+        """Let each step find the position of the sample. Returns the projections among `usable` that remain usable."""
         for step in (step for step in in_order(self.scan.selection) if isinstance(step, PlaceStep)):
             motion = step.place(self.scan, usable, self.stated_axis, phases.progress)
             self.moved[step.name] = motion
@@ -91,7 +92,7 @@ class ViewGeometry:
         return usable
 
     def calibrate(self, view_ids: NDArray[np.int64], phases: Phases) -> None:
-        """Calibrate the geometry from these projections, if that is requested."""
+        """Calibrate the geometry from these projections, if the user requested it."""
         for step in geometry_steps(self.scan.selection):
             if step.geometry:
                 phases.enter("calibration", "steps")
@@ -99,7 +100,7 @@ class ViewGeometry:
                 self.learnt[step.name] = learnt
 
     def uncalibrated(self, part: SelectedScan, view_ids: NDArray[np.int64]) -> Geometry:
-        """The geometry of projections of a part of the scan without calibration."""
+        """The geometry of projections of a part of the scan, before calibration."""
         source = part.source
         geometry = part.selection.geometry(self.stated_axis, source.table.angles[view_ids])
         if (aside := source.table.aside) is not None:
@@ -117,12 +118,12 @@ class ViewGeometry:
         return geometry
 
 
-_OF_A_CIRCLE = angles_shown.ORDER, "axis"  # rules that do not apply if vectors state the pose of each projection
+_OF_A_CIRCLE = angles_shown.ORDER, "axis"  # these rules do not apply if vectors state the pose of each projection
 
 
 def select(source: ScanSource, selection: Selection) -> SelectedScan:
-    """The scan with a selection, once per job: the monitor checks the frames, if that is requested, when their flags
-    are first used.
+    """Combine a scan with a selection; called once per job. If the user requested that the monitor checks the frames,
+    it does so when their flags are first used.
 
     Raises:
         ConfigError: as `Selection.of`.
@@ -136,7 +137,8 @@ def select(source: ScanSource, selection: Selection) -> SelectedScan:
 def checked_views(scan: SelectedScan, warn: Warn) -> UsableViews:
     """The usable projections of a finished scan, according to the flags of the monitor.
 
-    Faults of the file that do not prevent a reconstruction become warnings, and so does the effect of the flags.
+    Faults of the file that do not prevent a reconstruction become warnings. The effect of the flags is also reported as
+    a warning.
 
     Raises:
         DataError: the scan cannot be reconstructed; the message lists every reason and what to do about it.
@@ -162,8 +164,8 @@ def checked_views(scan: SelectedScan, warn: Warn) -> UsableViews:
 
 
 def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
-    """Raise DataError for the errors among the findings, with a remedy for each; numbers that overflowed explain all
-    other errors.
+    """Raise DataError for the errors among the findings, and say for each what to do. If counts overflowed, only this
+    is reported, because it explains all other errors.
     """
     errors = [finding for finding in findings if finding.severity == "error"]
     wrapped = [finding for finding in errors if finding.rule == WRAPPED]

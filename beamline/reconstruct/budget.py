@@ -12,17 +12,17 @@ from recon.base.method import Clock, Method
 from recon.base.volume import Grid
 from recon.forecast import Timing
 
-_TIMED_VOXELS = 2**17  # of the part that is timed: what it takes counts
+_TIMED_VOXELS = 2**17  # number of voxels of the part that is reconstructed to measure the time
 
 
 def in_budget(
     method: Method, budget: float, geometry: Geometry, grid: Grid, now: Clock, warn: Warn
 ) -> tuple[Method, str]:
-    """The choice, restricted to methods that end in time, or to the fastest method; and a sentence on which methods
-    remain and why.
+    """`method`, restricted to the candidates that end in time; if none of them does, the fastest candidate. The second
+    result is a sentence that says which methods remain, and why.
 
-    A few iterations of each method are timed, and the predicted times are compared with the remaining seconds. Nothing
-    else changes: the remaining methods run to their usual end, as without a time limit.
+    A few iterations of each method are timed. The times predicted from them are compared with the remaining seconds.
+    The remaining methods then run to their usual end, as without a time limit.
 
     Args:
         warn: function that gets a sentence if even the fastest method will be late.
@@ -56,5 +56,5 @@ def in_budget(
 
 
 def _without_slow(method: Method, kept: list[Method]) -> Method:
-    """The choice among `kept` alone; the only method left as itself."""
+    """The method that chooses only among `kept`; if only one method is left, that method."""
     return kept[0] if len(kept) == 1 else cast(Method, replace(cast(Any, method), candidates=tuple(kept)))

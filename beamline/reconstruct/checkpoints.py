@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,11 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.storage.recon_record import Value
 from beamline.storage.writers.recon_file import Checkpoint, read_checkpoint, write_checkpoint
 from recon.base.geometry import arrays_of
+from recon.base.volume import Volume
 from recon.splatting.checkpoint import state_from
 from recon.splatting.optimise import FitState
 
-_SHOWN = 40  # most characters of a value in a message
+_SHOWN = 40  # largest number of characters of a value in a message
 
 
 def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str, Value]) -> dict[str, Value]:
@@ -29,22 +30,27 @@ def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str,
 
     Args:
         prepared: line integrals and geometry; held-out projections have no effect.
-        settings: of the fit, or a method: a dataclass.
+        settings: the settings of the fit, or a method; a dataclass.
         others: seed, start and similar values, by name.
     """
     data = np.ascontiguousarray(prepared.seen.data, np.float32)
     out: dict[str, Value] = {
         "projections": hashlib.sha256(data.data).hexdigest(),
         "n_views": prepared.geometry.n_views,
-        "length_unit": prepared.length_unit,
+        "length_unit": prepared.origin.length_unit,
     }
     out |= arrays_of(prepared.geometry)
-    out |= {f"setting {name}": str(value) for name, value in asdict(settings).items()}
+    volumes = {each.name: of for each in fields(settings) if isinstance(of := getattr(settings, each.name), Volume)}
+    plain = asdict(replace(settings, **dict.fromkeys(volumes)) if volumes else settings)
+    out |= {f"setting {name}": str(value) for name, value in plain.items() if name not in volumes}
+    for name, volume in volumes.items():
+        voxels = np.ascontiguousarray(volume.data, np.float32)
+        out[f"setting {name}"] = f"{volume.grid}, {hashlib.sha256(voxels.data).hexdigest()}"
     return out | {f"setting {name}": value for name, value in others.items()}
 
 
 def differences(now: Mapping[str, Value], before: Mapping[str, Value]) -> list[str]:
-    """The differences between two origins (`made_from`), in words."""
+    """The differences between two origins (see `origin_of`), in words."""
     out = []
     for name in dict.fromkeys([*now, *before]):
         current, stored = now.get(name), before.get(name)
@@ -84,9 +90,8 @@ class CheckpointOptions:
         return self.path is not None or self.resume is not None
 
     def refuse_existing(self) -> None:
-        """Raise DataError before any work if the checkpoint to write exists, or the one to resume from is missing.
-
-        The checkpoint may replace the one that the fit resumes from.
+        """Raise DataError, before any work, in two cases: the checkpoint to write exists, or the checkpoint to resume
+        from is missing. A fit may replace the checkpoint from which it resumes.
         """
         if self.resume is not None:
             _read_state(self.resume)
@@ -97,14 +102,14 @@ class CheckpointOptions:
         """The state to resume from; None if the fit starts from the beginning.
 
         Args:
-            origin: of the fit, see `origin_of`.
+            origin: the origin of the fit, see `origin_of`.
             steps: planned number of steps; 0 if a time limit is planned.
-            warn: function that gets a sentence if the plan differs, because the volume then differs from that of an
-                uninterrupted fit.
+            warn: function that gets a sentence if the planned number of steps differs, because the volume then differs
+                from the volume of an uninterrupted fit.
 
         Raises:
             ConfigError: the fit has already made more steps than planned.
-            DataError: the checkpoint was made from something else.
+            DataError: the checkpoint has another origin.
         """
         if self.resume is None:
             return None
@@ -126,8 +131,9 @@ class CheckpointOptions:
         return kept.state
 
     def write(self, origin: Mapping[str, Value], steps: int, warn: Warn, state: Mapping[str, NDArray[Any]]) -> str:
-        """Write the checkpoint. If the disk refuses, warn, return the reason, and let the fit continue; "" on
-        success."""
+        """Write the checkpoint and return "". If the disk refuses, the fit continues: the function warns and returns
+        the reason.
+        """
         if self.path is None:
             return ""
         try:
@@ -142,13 +148,13 @@ def _read_state(path: Path) -> tuple[Checkpoint, FitState]:
     """The checkpoint, and the state in it.
 
     Raises:
-        DataError: there is no checkpoint, or it holds no state to resume from.
+        DataError: there is no checkpoint, or it does not contain a state to resume from.
     """
     kept = read_checkpoint(path)
     try:
         reached = state_from(kept.state)
         for name, values in kept.state.items():
-            # The last loss and the best of views held out may be NaN; a Gaussian's exponent is infinite.
+            # The last loss, and the best one of the held-out views, may be NaN; a Gaussian's exponent is infinite.
             if name not in ("scalars", "watch", "kernel_exponent") and not np.isfinite(values).all():
                 raise ValueError(f"{name} of the checkpoint has values that are not finite")
         if not (np.isfinite(reached.unit) and reached.unit > 0):

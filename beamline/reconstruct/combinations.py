@@ -1,7 +1,6 @@
-"""Which options of a reconstruction exclude each other, and why. The command line, a recipe, Python and the plan of a
-reconstruction all ask this table.
-
-The module imports nothing that the help of a command does not need.
+"""Combinations: the options of a reconstruction that exclude each other, and why. The command line, recipes, the Python
+interface and the plan of a reconstruction all use this table. The help of a command imports this module, so the module
+imports nothing that the help does not need.
 """
 
 from __future__ import annotations
@@ -11,7 +10,8 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 SLABS_RESUMED = "resume of slabs"
-"""Name for `--resume` with a partial volume, because other rules apply to it than to a checkpoint."""
+"""Name for `--resume` with a partial volume, because the rules for a partial volume differ from those for a checkpoint.
+"""
 
 _FINISHED = {"follow": "it needs a finished scan"}
 _PLANNED = {"quality": "--quality already sets it"}
@@ -32,7 +32,7 @@ EXCLUDED: Mapping[str, Mapping[str, str]] = MappingProxyType(
             "uncertainty": "error bars are not calibrated for it",
             "roi": "the motion of the sample is estimated in all of the field",
         },
-        "volumes": {  # in time, or of materials
+        "volumes": {  # volumes in time, or volumes of materials
             **_FINISHED,
             "roi": "a box can be cut only from a single volume",
             "truth": "a ground truth can be compared only with a single volume",

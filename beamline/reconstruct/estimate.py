@@ -32,12 +32,12 @@ class Estimate(Need):
     `scratch` is 0 if the reconstruction runs in memory.
 
     Attributes:
-        shape: of the volume [z, y, x], or of several volumes [volume, z, y, x].
-        at_once: bytes of memory if everything is in memory.
+        shape: shape of the volume [z, y, x], or of several volumes [volume, z, y, x].
+        at_once: bytes of memory that the reconstruction needs if everything is in memory.
         allowed: bytes of memory that may be used.
         slabs: number of slabs that are not yet reconstructed.
         done: number of slices that a partial volume already has.
-        free: bytes on the disk of the output.
+        free: free bytes on the disk of the output.
     """
 
     method: str
@@ -73,14 +73,14 @@ class Estimate(Need):
 
 
 def estimate(options: ReconOptions, now: Clock = time.perf_counter) -> Estimate:
-    """Estimate a reconstruction of a finished scan; for a partial volume, of the missing slabs. The method runs for a
-    few iterations on simulated views; frames are read only to find a region around the sample.
+    """Estimate a reconstruction of a finished scan; for a partial volume, estimate the missing slabs. The method runs
+    for a few iterations on simulated views. Frames are read only to find a region around the sample.
 
     Raises:
         DataError: the reconstruction does not fit into the memory or on the disk; the message names the option that
-            would make it fit. Also for a partial volume with another number of slices.
-        ConfigError: the selection does not fit the scan, or an option needs more memory than there is.
-        All other errors that the reconstruction raises before it reads a frame.
+            would make it fit. A partial volume has another number of slices.
+        ConfigError: the selection does not fit the scan, or an option needs more memory than there is. The estimate
+            also raises all other errors that the reconstruction raises before it reads a frame.
     """
     truth = refuse_before_reading(options)
     with options.source.open() as source:
@@ -119,7 +119,9 @@ def _slices(slabs: Sequence[Slab]) -> int:
 def _seconds(
     options: ReconOptions, method: Method, geometry: Geometry, missing: Sequence[Slab], now: Clock
 ) -> tuple[float, float] | None:
-    """The least and the most seconds of these slabs; None if they are not known before the method is tried."""
+    """The shortest and the longest time in s for these slabs; None if the times are not known before the method is
+    tried.
+    """
     if not missing:
         return 0.0, 0.0
     grid = Grid.matching(geometry)
@@ -127,19 +129,20 @@ def _seconds(
         for candidate in method.alternatives:
             warm_up(candidate, geometry)
         expected = forecast(method, geometry, grid, now)
-    except ValueError as error:  # as the method itself refuses the views
+    except ValueError as error:  # the method would refuse the views in the same way
         raise DataError(f"{options.source.path} cannot be reconstructed by {method.name}: {error}") from error
     if expected is None:
         return None
-    choice = 0.0 if options.partial is not None else expected.choice_seconds  # it was made before
-    share = sum(slab.slices.stop - slab.slices.start for slab in missing) / grid.shape[0]  # slabs overlap
-    bars = 1 + options.uncertainty  # error bars take at most as long
+    choice = 0.0 if options.partial is not None else expected.choice_seconds  # a partial volume already has the choice
+    # the sum counts the overlap of slabs twice
+    share = sum(slab.slices.stop - slab.slices.start for slab in missing) / grid.shape[0]
+    bars = 1 + options.uncertainty  # the error bars take at most as long as the volume
     least, most = (bars * (choice + share * each(expected.volumes.values())) for each in (min, max))
     return least, most
 
 
 def _refuse_scan(scan: SelectedScan) -> None:
-    """Raise ConfigError and DataError as the reconstruction, before it reads a frame."""
+    """Raise the ConfigErrors and DataErrors that the reconstruction raises before it reads a frame."""
     require_usable(scan)
     for axis in (scan.selection.axis_col, scan.source.axis_col if scan.selection.cone is None else None):
         if axis is not None:

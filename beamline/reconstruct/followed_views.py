@@ -1,4 +1,4 @@
-"""Projections of a growing file: which frames they are, their geometry, and how many of them the fit has used."""
+"""Followed views: the projections of a growing file, their geometry, and the search for the rotation axis in them."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ class FollowedViews:
     """The selected projections of a scan file that is still growing.
 
     Attributes:
-        scan: as it was when the live fit began; `renewed` has the frames recorded since then.
+        scan: the scan as it was when the live fit began; `renewed` has the frames recorded since then.
     """
 
     scan: SelectedScan
 
     @property
     def source(self) -> ScanSource:
-        """Reads the frames."""
+        """The source that reads the frames."""
         return self.scan.source
 
     @property
@@ -48,15 +48,15 @@ class FollowedViews:
         return usable_views(self.scan.renewed().evidence, self.scan.selection.step(Preparation).uses_flags)
 
     def chosen(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Those of these frames that the selection uses. It selects by the index among all projections so far, which
-        does not change when later ones arrive.
+        """The frames among `frames` that the selection uses. The selection counts projections from the start of the
+        scan, so it selects the same ones when later projections arrive.
         """
         taken = self.source.table.of_kind(FrameKind.PROJECTION, FrameKind.INVALID)
         chosen = parse_views(self.scan.selection.views, np.zeros(taken.size))
         return frames[np.isin(frames, taken[chosen])]
 
     def geometry(self, axis_col: float, view_ids: NDArray[np.int64]) -> tuple[Geometry, StepDone]:
-        """The geometry of these projections with the width of their rays, and what the step for it did."""
+        """The geometry of these projections with the width of their rays, and what the step for the width did."""
         geometry = self.scan.selection.geometry(axis_col, self.source.table.angles[view_ids])
         return self.scan.selection.step(Width).rays(self.scan, geometry)
 
@@ -80,11 +80,11 @@ class AxisSearch:
     at 180°, and at the end.
 
     Attributes:
-        estimate: how the axis was found; None: it was not found, or it was given or stated.
+        estimate: how the axis was found; None: the axis was not found, or the user or the file stated it.
         settled: the search is over.
         next_views: number of projections with which the next search is due.
-        turned: radians that the projections covered at the last look.
-        told: it was reported that the axis is unknown.
+        turned: angle in radians that the projections covered at the last search.
+        told: True if it was already reported that the axis is unknown.
     """
 
     estimate: AxisEstimate | None = None
@@ -107,11 +107,11 @@ class AxisSearch:
 
         Args:
             views: rows of the file.
-            known: the axis found before; None: none.
-            ended: the scan has ended.
+            known: the axis found before; None: no axis was found before.
+            ended: True if the scan has ended.
 
         Returns:
-            The search after this look, and the axis in pixels of the file; None as long as it is unknown.
+            The search after this call, and the axis in pixels of the file (None as long as it is unknown).
 
         Raises:
             DataError: the scan has ended, and no axis is found.
@@ -131,7 +131,7 @@ class AxisSearch:
             if last_chance:
                 raise
         else:
-            if last_chance and located.warning:  # before, the axis will be searched again
+            if last_chance and located.warning:  # until then, the axis will be searched again
                 warn(located.warning)
             if located.estimate.confident or last_chance:
                 search, known = replace(search, estimate=located.estimate), located.col

@@ -51,7 +51,8 @@ from recon.warm_up import warm_up
 def progress_events(
     sink: Sink, clock: Clock, seconds: float | None = None, waiting: Callable[[], int] = lambda: 0
 ) -> Callable[[Progress], None]:
-    """A listener that forwards progress as events, with `per_s` (steps) and `eta_s` (None if not known).
+    """A listener that forwards progress as events, with steps per second (`per_s`) and the estimated remaining time in
+    s (`eta_s`; None if it is not known).
 
     Args:
         seconds: time limit of the fit, if no number of steps is planned.
@@ -68,7 +69,7 @@ def progress_events(
         n_done, spent = progress.step - first.step, progress.seconds - first.seconds
         rate = n_done / spent if n_done > 0 and spent > 0 else None
         eta = None
-        if progress.steps:  # of this part of the work only
+        if progress.steps:  # the remaining time of this part of the work only
             eta = seconds_left(n_done, progress.steps - first.step, spent)
         elif seconds is not None and not progress.unit:
             eta = max(0.0, seconds - spent)
@@ -102,7 +103,7 @@ class Channels:
     Attributes:
         stop_scope: context in which the work can be stopped with the volume reached so far.
         started: time at which the call started, by `clock`.
-        worked: CPU time in s that this process had used by then.
+        worked: CPU time in s that this process had used when the call started.
     """
 
     sink: Sink
@@ -122,10 +123,10 @@ class Job:
         options: the options, with the rows that show the region and the time that remains for the method.
         facts: reads the facts of the scan, after the volume is done.
         stopping: context in which the work can be stopped with the volume reached so far.
-        stop: the stop request of the open context.
+        stop: the stop request of the context that is open now.
         slabs: the slabs in which the volume is reconstructed; empty: in one piece.
-        final_fit: end of a fit that has grown with the projections; None: the method of the options is used.
-        leaves: tells whether this number of seconds is left before the report.
+        final_fit: last part of a fit that has grown with the projections; None: the method of the options is used.
+        leaves: function that returns True if this number of seconds is left before the report.
     """
 
     options: ReconOptions
@@ -141,7 +142,7 @@ class Job:
 
     @property
     def grid(self) -> Grid:
-        """Grid of the volume; for a direct method, only that of the requested region."""
+        """Grid of the volume; for a direct method, the grid of the requested region only."""
         grid = Grid.matching(self.prepared.geometry)
         return self.region.grid_of(grid) if self.region is not None and self.options.method.makes_boxes else grid
 
@@ -151,7 +152,7 @@ class Job:
         return self.final_fit or self.options.method_for(self.prepared.geometry)
 
     def say(self, text: str, state: str = "slab") -> None:
-        """Report progress of a slab, or another state."""
+        """Report the progress of a slab, or that the job has entered another state."""
         self.channels.sink(StateEntered(state, text, time=self.channels.clock.now()))
 
     def listener(self, seconds: float | None = None) -> Callable[[Progress], None]:
@@ -170,7 +171,7 @@ def refused(options: ReconOptions, by: str = "") -> Iterator[None]:
 def compile_kernels(options: ReconOptions, geometry: Geometry, sink: Sink, clock: Clock) -> None:
     """Compile the kernels in this process (only once per computer) and report it. Cluster workers compile their own.
 
-    The time for this counts neither as time of the run nor in the estimated remaining time.
+    The time for the compilation counts neither as time of the run nor in the estimated remaining time.
     """
     method, compiled = options.method, compilation_events(sink, clock)
     methods = method.alternatives if options.budget is not None else (method,)
@@ -182,7 +183,7 @@ def compile_kernels(options: ReconOptions, geometry: Geometry, sink: Sink, clock
 def runner_of(
     options: ReconOptions, reconstruct: Callable[..., Reconstruction] = recon.reconstruct, times: F64 | None = None
 ) -> RunMethod:
-    """`run_on` with the seed and device of the options. Errors of the method name the scan file."""
+    """Call `run_on` with the seed and device of the options. Errors of the method name the scan file."""
 
     def run(method: Method, views: Views, grid: Grid, control: RunControl) -> Reconstruction:
         with refused(options, f" by {method.name}"):
@@ -192,7 +193,9 @@ def runner_of(
 
 
 def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
-    """Reconstruct in slabs or in one piece. Returns the volume (0 if no ray passed) and the projections used."""
+    """Reconstruct in slabs or in one piece. Returns the volume (0 if no ray passes through it) and the projections
+    used.
+    """
     result, used = _volume_of(job, decided)
     lost, volume, geometry = np.setdiff1d(*used.unmeasured_rows), result.volume, used.geometry
     if lost.size and geometry.is_cone:
@@ -218,21 +221,23 @@ def _volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedPr
         result = _at_once(job, decided)
         return replace(result, outside=None), without_outside(prepared, result)
     result = _by_slabs(job, decided)
-    if not job.options.method.weighs and prepared.view_weights is not None:
+    if not job.options.method.weighs and prepared.sources.of_views is not None:
         # Only recorded, because FBP and its figures of merit treat all rays equally.
-        result = replace(result, settings={**result.settings, "view_weights": prepared.view_weights})
-        prepared = replace(prepared, view_weights=None)
+        result = replace(result, settings={**result.settings, "view_weights": prepared.sources.of_views})
+        prepared = replace(prepared, sources=replace(prepared.sources, of_views=None))
     return result, prepared
 
 
 def _ended(result: Reconstruction, ending: Ending, chosen: str = "") -> Reconstruction:
-    """The result with its ending and the reason for the method, without data that only a resumed fit would need."""
+    """The result with how it ended and why its method was chosen, without data that only a resumed fit would need."""
     chosen = chosen or (result.chosen and f"{result.method}: {result.chosen}")
     return replace(result, chosen=chosen, ending=ending, checkpoint=None, at=None)
 
 
 def with_error_bars(job: Job, result: Reconstruction, decided: Decisions) -> Reconstruction:
-    """The volume with the standard deviation of each voxel. If this is stopped, the volume without it and a warning."""
+    """The volume with the standard deviation of each voxel. If this computation is stopped, the volume is returned
+    without the standard deviation, and a warning is given.
+    """
     if result.ending.early:
         job.channels.warn("No error bars were computed, because the reconstruction was stopped.")
         return result
@@ -265,11 +270,11 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
     options, prepared, checkpoints, method = job.options, job.prepared, job.options.checkpoints, job.method
     origin, resume, steps = {}, None, 0
     if checkpoints.wanted:
-        assert isinstance(method, Fit)  # for other methods the options raised an error
+        assert isinstance(method, Fit)  # other methods do not reach this line: the options raised an error
         settings, others = method.provenance
         origin, steps = origin_of(prepared, settings, {"seed": options.seed, **others}), method.planned_steps or 0
         resume = checkpoints.begin(origin, steps, job.channels.warn)
-    lost = ""  # why the last checkpoint could not be written
+    lost = ""  # the reason if the last checkpoint could not be written
 
     def keep(state: Mapping[str, NDArray[Any]]) -> None:
         nonlocal lost
@@ -309,7 +314,7 @@ def _of_preset(job: Job, result: Reconstruction) -> str:
 
 
 def _is_early(job: Job, result: Reconstruction) -> bool:
-    """Whether a stop ended the method before its last step."""
+    """Whether a stop request ended the method before its last step."""
     method = job.method
     # Voxel refinement, and the factors of several volumes, come after the last step and can also be stopped.
     if isinstance(method, Series) or (isinstance(method, Fit) and method.finish_sweeps > 0):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 from beamline.core.errors import DataError
 from beamline.core.events import StateEntered
@@ -33,16 +32,16 @@ _OFFSET = "Correcting all projections again, now together with the laterally off
 
 
 def ended(live: LiveScan, state: Feeds, scan: SelectedScan, usable: UsableViews) -> LastFit:
-    """The end of a scan, or of its reading: no projection comes any more.
+    """The state at the end of a scan, or of its reading: no projection comes any more.
 
     Args:
-        scan: with all that is recorded.
-        usable: its projections that may be used.
+        scan: the scan with all recorded frames.
+        usable: the projections of the scan that may be used.
 
     Raises:
         DataError: fewer than two projections of the scan can be used.
     """
-    state = settled(live, state)  # the scan was stopped: no other projection comes
+    state = settled(live, state)  # the scan was stopped, so that no other projection comes
     if usable.jumps.size:
         live.warn(
             f"The sample jumped at {frames_text(usable.jumps)}. The live volume does not correct for it. After the "
@@ -55,7 +54,7 @@ def ended(live: LiveScan, state: Feeds, scan: SelectedScan, usable: UsableViews)
 
 
 def _prepared(live: LiveScan, state: Feeds, scan: SelectedScan, usable: UsableViews) -> PreparedProjections:
-    """All projections, once recorded, after the steps that need all of them."""
+    """All projections, after the correction steps that need all of them."""
     projections, places = joined(state), ViewGeometry(scan, state.axis_col)
     geometry, axis = places.of(projections.view_ids), (state.axis_col, state.search.estimate)
     compare_with_flats(scan, projections, live.warn, refused=False)
@@ -63,25 +62,26 @@ def _prepared(live: LiveScan, state: Feeds, scan: SelectedScan, usable: UsableVi
     done = {**state.correction.plan.done, **places.done}
     for step in in_order(scan.selection):
         if isinstance(step, PlaceStep):
-            done[step.name] = StepDone(parameters={})  # projections are taken as if the sample had not moved
+            done[step.name] = StepDone(parameters={})  # the sample is assumed not to have moved
         if isinstance(step, ScanStep):
             try:
                 angles = live.source.table.angles[projections.view_ids]
                 done[step.name] = step.apply(prepared, angles, lambda n, of: None)
-            except DataError as error:  # not a reason to discard the volume
+            except DataError as error:  # the error is not a reason to discard the volume
                 live.warn(str(error))
                 continue
             if done[step.name].sentence:
                 live.tell_done({step.name: done[step.name]})
                 state.fit.replace_views(prepared.centred.with_gaps)
-    return with_reach(scan, replace(prepared, done=done))
+    return with_reach(scan, prepared.stating(done=done))
 
 
 def final_fit(
     live: LiveScan, last: LastFit, seconds: float, snapshot_every: float, write_snapshot: Callable[[], None]
 ) -> FinalFit:
-    """The final fit, to be run on the prepared projections: one pass over all of them, then the refinement of the
-    voxel volume, with a snapshot every `snapshot_every` s."""
+    """The final fit, to be run on the prepared projections: one pass over all of them, then the voxel refinement. It
+    writes a snapshot every `snapshot_every` s.
+    """
     written = live.clock.now()
 
     def look(progress: Progress) -> None:

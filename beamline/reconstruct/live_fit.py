@@ -1,6 +1,6 @@
 """Live fit: follows the file of a running scan, and reports the progress, slices and snapshots of its volume.
 
-`live_states` and `live_steps` are the state machine that it drives.
+The live fit drives the state machine of `live_states` and `live_steps`.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ _LEAST_VIEWS = 16  # projections needed for a volume after a stop
 
 
 class ScanFollower:
-    """Follows the file of a running scan and updates the volume. The caller decides when to read, to fit and to end.
+    """Follows the file of a running scan and updates the volume. The caller decides when to read the file, when to fit,
+    and when to end.
 
     Attributes:
-        state: where the live fit is; only `take_new_frames` and `advance` change it.
+        state: state of the live fit; only `take_new_frames` and `advance` change it.
         snapshots: the files that show the volume so far.
     """
 
@@ -47,7 +48,7 @@ class ScanFollower:
 
     @property
     def source(self) -> ScanSource:
-        """The file; whoever opened it closes it."""
+        """The file of the scan; whoever opened it closes it."""
         return self._live.source
 
     @property
@@ -81,7 +82,9 @@ class ScanFollower:
         return n > before.frames
 
     def catch_up(self, should_stop: Callable[[], bool]) -> None:
-        """Read the remaining frames of a scan that has ended; after a stop, only those that a volume needs."""
+        """Read the remaining frames of a scan that has ended. After a stop request, read only as many as a volume
+        needs.
+        """
         while self._cursor.behind:
             if self.n_views_taken >= _LEAST_VIEWS and should_stop():
                 self._live.warn(
@@ -92,13 +95,14 @@ class ScanFollower:
             self.take_new_frames(ended=True)
 
     def advance(self, seconds: float) -> bool:
-        """Fit for a while; returns False if there is nothing to fit yet."""
+        """Fit for `seconds` s; returns False if there is nothing to fit yet."""
         if not isinstance(self.state, Feeds):
             return False
         progress = self.state.fit.advance(seconds)
         if not self.state.fit.started:
             return False
-        # A fit that begins again counts from its own beginning; the history has one time, that of the snapshots.
+        # A fit that starts again counts its time from its own start; the history and the snapshots count from one
+        # start.
         progress = replace(progress, seconds=self._live.clock.now() - self._live.begin)
         self._tell_progress(progress)
         self.state = after_progress(self._live, self.state, progress, self.waiting)
@@ -120,7 +124,9 @@ class ScanFollower:
             self._slices.draw(state.corrected, state.axis_col, pause)
 
     def write_snapshot(self) -> None:
-        """Write the current volume and its picture, replacing the last ones; nothing before the fit has begun."""
+        """Write the current volume and its picture, which replace the last ones. Nothing is written before the fit has
+        begun.
+        """
         if isinstance(self.state, Feeds):
             self.snapshots.write(self.state.fit, float(self.state.axis_col))
 

@@ -1,4 +1,6 @@
-"""Pictures of a state while it is scanned: FBP of its projections, and the moved reference with FBP of the rest."""
+"""Live pictures of a scan with a reference: FBP of the projections so far, and the moved reference plus FBP of the
+residual.
+"""
 
 from __future__ import annotations
 
@@ -25,12 +27,13 @@ from recon.base.method import Preview
 from recon.base.view_data import Views
 from recon.base.views import spread
 
-_SIDE, _ROWS = 256, 8  # columns and rows of the picture at most; rows as wide as binned columns
-_MOST_VIEWS = 180  # projections that are corrected for a picture
+# largest number of columns and of rows of the picture; its rows are as wide as the binned columns
+_SIDE, _ROWS = 256, 8
+_MOST_VIEWS = 180  # largest number of projections that are corrected for a picture
 
 
 class ReferencePictures:
-    """Draws a scan that is followed until its end, for a method that needs all of its projections.
+    """Draws pictures of a running scan whose method needs all projections, and so waits for the end of the scan.
 
     Attributes:
         snapshots: has the path of the picture.
@@ -46,12 +49,13 @@ class ReferencePictures:
         self._axis = source.axis_col if stated is None else stated
 
     def draw(self, pause: float | None) -> None:
-        """Draw the projections so far, if there are new ones, and `pause` s and the time of the last drawing have
-        passed. None: the scan has ended, draw now."""
+        """Draw the projections so far, if there are new ones, and `pause` s and the time that the last drawing took
+        have passed. None: the scan has ended, so draw now.
+        """
         views = self._views.chosen(self._views.usable().frames)
         if views.size < FEWEST or not self._slices.due(views, pause):
             return
-        with suppress(DataError):  # for example, flats are still to come; the scan and the reconstruction continue
+        with suppress(DataError):  # for example, flats are not taken yet; the scan and the reconstruction continue
             plan = survey(self._views.scan.renewed())
             if self._axis is None or self._search.estimate is not None:
                 self._search, self._axis = self._search.look(
@@ -64,7 +68,9 @@ class ReferencePictures:
 def row_of(
     preview: Callable[[Views], Preview | None], unit: str
 ) -> Callable[[Sequence[F32], Geometry], PictureRow | None]:
-    """A function that gives the row of a picture with the preview of projections; None: there is no preview."""
+    """A function that makes one row of a picture: the preview of projections. It returns None if there is no
+    preview.
+    """
 
     def row(views: Sequence[F32], geometry: Geometry) -> PictureRow | None:
         shown = preview(middle_of(views, geometry))

@@ -1,11 +1,12 @@
-"""States of the live fit: reconstructs a volume from the frames of a running scan.
+"""States of the live fit, which reconstructs a volume from the frames of a running scan.
 
 ```
 WaitsForReferences --darks and flats can be used--> WaitsForAxis --its column is known--> Feeds --end--> LastFit
 ```
 
-`live_steps` has the functions from one state to the next. Each reading of the file goes as far as possible: with the
-first projection the fit may pass two states and take a batch. A known axis is not waited for.
+The functions of `live_steps` lead from one state to the next. After each reading of the file, they go as far as
+possible: with the first projection the fit may pass two states and take a batch. If the axis is known, the fit does not
+wait for it.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from recon.splatting.stream import StreamingFit
 
 @dataclass(frozen=True, eq=False)
 class LiveScan:
-    """A running scan, and how its volume is made. Nothing of it changes; only the file of `views` grows.
+    """A running scan, and how its volume is made. The object does not change; only the file of `views` grows.
 
     Attributes:
         begin: time at which the live fit began to wait for projections.
@@ -66,13 +67,13 @@ class LiveScan:
 
 @dataclass(frozen=True, eq=False)
 class Cursor:
-    """What a growing file has, and how much of it the fit has used.
+    """How many frames a growing file has, and how many of them the fit has used.
 
     Attributes:
         frames: number of frames in the file when it was last read.
-        views: rows of the projections among them that may be used.
+        views: rows of the projections in the file that may be used.
         ended: the scan has ended, so that no frame comes after these.
-        taken: number of the frames that were corrected, or that are not projections.
+        taken: number of frames that were corrected or are not projections.
     """
 
     frames: int = 0
@@ -96,9 +97,10 @@ class WaitsForReferences:
     """The correction cannot begin: no projection is there, or darks or flats are missing.
 
     Attributes:
-        scan: as it was when it was last looked at.
-        axis_col: the rotation axis in pixels of the file, as it is stated; None: it must be found.
-        come_last: darks or flats come after the projections, which was reported; so the fit waits for the end.
+        scan: the scan as it was when the file was last read.
+        axis_col: the stated rotation axis in pixels of the file; None: the axis must be found.
+        come_last: darks or flats come after the projections, so the fit waits for the end of the scan; this was
+            reported.
     """
 
     scan: SelectedScan
@@ -111,7 +113,7 @@ class WaitsForAxis:
     """Projections can be corrected, but they do not show the rotation axis yet.
 
     Attributes:
-        correction: with the references known by now; it has corrected no projection yet.
+        correction: the correction with the references known so far; it has not corrected any projection yet.
         search: the search so far.
     """
 
@@ -121,22 +123,20 @@ class WaitsForAxis:
 
 @dataclass(frozen=True, eq=False)
 class Feeds:
-    """The fit takes the projections as they come.
-
-    `fit` and `batches` change in place, the last one so that a scan is in memory only once. So only the
-    newest `Feeds` is valid.
+    """The fit takes the projections as they come. `fit` and `batches` change in place, so only the newest `Feeds` is
+    valid. `batches` changes in place so that the projections are in memory only once.
 
     Attributes:
-        correction: corrects the next projections; it knows those before.
+        correction: the correction of the next projections; it keeps what it learnt from the earlier ones.
         axis_col: the rotation axis in pixels of the file.
         search: how the axis was found. While it is not settled, a better axis may be found.
-        fit: has the projections of `batches` and the newest one.
+        fit: the fit; it has used the projections of `batches` and the newest one.
         batches: line integrals of the projections with their final correction.
-        newest: the projection after them. The fit uses it already, but it is corrected again together with the next
-            one; None: there is none.
+        newest: the projection after those of `batches`; None: there is no such projection. The fit uses it already, but
+            the projection is corrected again together with the next one.
         part: the part of the file whose projections were corrected last.
-        history: progress so far, also of fits before the axis moved.
-        told_behind: it was reported that the fit is slower than the scan.
+        history: progress so far, with that of the fits before the axis changed.
+        told_behind: True if it was reported that the fit is slower than the scan.
     """
 
     correction: FedCorrection
@@ -165,7 +165,7 @@ class LastFit:
     """The scan has ended, and all projections are corrected: only the final fit remains.
 
     Attributes:
-        prepared: all projections with their final correction, as the model was fitted to them, and the laterally offset
+        prepared: all projections with the final correction, to which the model was fitted, and the laterally offset
             projections.
         fit, axis_col, history: see `Feeds`.
     """

@@ -1,4 +1,4 @@
-"""Steps of the live fit: what the new frames of a growing file make of its state."""
+"""Steps of the live fit: functions that compute the next state from the new frames of a growing file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from recon.prep.projections import Projections, merge_and_empty
 from recon.splatting.stream import StreamingFit
 
 _ONE_VIEW = np.zeros(1)  # rad
-BATCH_VIEWS = 32  # projections that are corrected before the fit continues
+BATCH_VIEWS = 32  # number of projections that are corrected before the fit continues
 _BEHIND = (
     0.5  # steps per projection; below this, FBP matches the projections better (tests/bench/test_live_accuracy.py)
 )
@@ -49,10 +49,10 @@ def next_state(live: LiveScan, state: Following, file: Cursor) -> tuple[Followin
     """Go through the states as far as the projections of the file allow, and feed the fit with one batch.
 
     Returns:
-        The next state, and the cursor behind the projections that were taken.
+        The next state, and the cursor after the projections that were taken.
 
     Raises:
-        ConfigError, DataError: the scan has no references or no axis, and none will come; or projections that cannot be
+        ConfigError, DataError: the scan has no references or no axis and will not get them, or projections cannot be
             corrected.
     """
     if isinstance(state, WaitsForReferences):
@@ -67,10 +67,10 @@ def next_state(live: LiveScan, state: Following, file: Cursor) -> tuple[Followin
 def with_references(live: LiveScan, state: WaitsForReferences, ended: bool) -> Following:
     """The correction begins if darks and flats can be used.
 
-    Those that come after the projections are all there when the scan has ended, not before.
+    If darks or flats come after the projections, they are complete only when the scan has ended.
 
     Raises:
-        DataError: the scan has ended, or something else is missing, and nothing will come.
+        DataError: the correction cannot begin, and no later frame can change this.
     """
     scan = state.scan.renewed()
     blockers = findings_of(scan.evidence, BEFORE_VIEWS)
@@ -103,7 +103,7 @@ def with_axis(live: LiveScan, state: WaitsForAxis, file: Cursor) -> WaitsForAxis
 
 
 def with_better_axis(live: LiveScan, state: Feeds, file: Cursor) -> Feeds:
-    """After a large move of the axis the fit begins again with all projections; after a small one it continues."""
+    """After a large change of the axis the fit begins again with all projections; after a small change it continues."""
     before = state.axis_col
     search, axis_col = state.search.look(live.views, state.correction.plan, file.views, before, file.ended, live.warn)
     if axis_col is None or axis_col == before:
@@ -111,15 +111,16 @@ def with_better_axis(live: LiveScan, state: Feeds, file: Cursor) -> Feeds:
     if abs(axis_col - before) <= _AXIS_MOVES:
         state.fit.move_axis(live.selection.geometry(axis_col, _ONE_VIEW).axis_col)
         return replace(state, search=search, axis_col=axis_col)
-    state.fit.clear()  # not both in memory
+    state.fit.clear()  # free the memory of the old fit before the new fit is made
     fit = _new_fit(live, axis_col, again=bool(state.history))
     for batch in state.batches:
         fit.add_views(batch.measured, live.views.angles(axis_col, batch.view_ids))
-    return replace(state, search=search, axis_col=axis_col, fit=fit, newest=None)  # the next views bring it again
+    # the next views correct the newest projection again
+    return replace(state, search=search, axis_col=axis_col, fit=fit, newest=None)
 
 
 def new_correction(live: LiveScan, scan: SelectedScan, views: NDArray[np.int64] = NO_VIEWS) -> FedCorrection:
-    """A correction with the references of `scan`, which has corrected no projection yet; `views` as in `survey`."""
+    """A correction with the references of `scan`. It has not corrected any projection yet. For `views` see `survey`."""
     plan = survey(scan, views)
     for sentence in plan.warnings:
         live.warn(sentence)
@@ -127,7 +128,7 @@ def new_correction(live: LiveScan, scan: SelectedScan, views: NDArray[np.int64] 
 
 
 def corrected_alone(live: LiveScan, state: WaitsForAxis, frames: NDArray[np.int64]) -> Projections:
-    """Line integrals of frames with all references recorded by now, without feeding anything."""
+    """Line integrals of frames, corrected with all references recorded so far. The fit does not get them."""
     return apply(new_correction(live, state.correction.plan.scan.renewed()).plan, frames, warn=live.warn)
 
 
@@ -148,7 +149,9 @@ def _new_fit(live: LiveScan, axis_col: float, again: bool) -> StreamingFit:
 
 
 def fed(live: LiveScan, state: Feeds, file: Cursor) -> tuple[Feeds, Cursor]:
-    """Feed the fit with the next projections, all of one part of the file, because each part has its own references."""
+    """Feed the fit with the next projections. They all belong to one part of the file, because each part has its own
+    references.
+    """
     new = file.new
     parts = np.searchsorted(live.source.table.part_starts, new, "right") - 1
     if new.size and parts[0] != state.part:
@@ -160,9 +163,9 @@ def fed(live: LiveScan, state: Feeds, file: Cursor) -> tuple[Feeds, Cursor]:
 
 
 def _in_part(live: LiveScan, state: Feeds, part: int) -> Feeds:
-    """Begin a later part of the file: its projections are corrected with its own references.
-
-    The fit takes the last projection of the part before, which waited for the next, and learns all projections again.
+    """Begin a later part of the file, whose projections are corrected with their own references. The last projection of
+    the part before waited for the next projection. Now its correction becomes final, and the fit learns all projections
+    again.
     """
     state = settled(live, replace(state, part=part))
     if state.batches:
@@ -171,12 +174,14 @@ def _in_part(live: LiveScan, state: Feeds, part: int) -> Feeds:
 
 
 def settled(live: LiveScan, state: Feeds) -> Feeds:
-    """Correct the newest projection for good: no other comes that it waits for."""
+    """Make the correction of the newest projection final, because the projection for which it waits does not come."""
     return state if state.newest is None else _with_frames(live, state, NO_VIEWS, last=True)
 
 
 def _with_frames(live: LiveScan, state: Feeds, frames: NDArray[np.int64], last: bool) -> Feeds:
-    """Correct frames and feed the fit with them, also with the newest, whose correction waits for the next one."""
+    """Correct frames and feed the fit with them. The fit also gets the newest frame, although its correction waits for
+    the next frame.
+    """
     newest = state.newest
     batch, correction = feed(state.correction, frames, last=last, warn=live.warn)
     if batch is not None:
@@ -196,10 +201,11 @@ def _with_frames(live: LiveScan, state: Feeds, frames: NDArray[np.int64], last: 
 def corrected_again(
     live: LiveScan, state: Feeds, usable: UsableViews, why: str, wide: NDArray[np.int64] = NO_VIEWS
 ) -> Feeds:
-    """Recompute line integrals with all references and air columns, replacing those that the model was fitted to.
+    """Recompute line integrals with all references and air columns. They replace the line integrals to which the model
+    was fitted.
 
-    Does nothing if all projections belong to one part, references and air columns are unchanged, no object is in
-    the beam of all projections, and no `wide` (laterally offset) projections join them. `why` is reported, unless
+    The function does nothing if all projections belong to one part, references and air columns are unchanged, no object
+    is in the beam of all projections, and there are no `wide` (laterally offset) projections. `why` is reported, unless
     projections are removed from the fit.
 
     Some of these projections may have become unusable, because a check flagged them after later projections
@@ -222,7 +228,7 @@ def corrected_again(
             "later or the scan took again"
         )
     live.enter("correcting", why)
-    state.batches.clear()  # not both in memory
+    state.batches.clear()  # free the memory of the old line integrals first
     correction = new_correction(live, correction.plan.scan.renewed(), every := np.union1d(frames, wide))
     again = apply(correction.plan, every, warn=live.warn)
     state.batches.append(again)
@@ -234,7 +240,7 @@ def corrected_again(
 def joined(state: Feeds) -> Projections:
     """The line integrals of `batches` in one piece; they become one batch."""
     if len(state.batches) > 1:
-        state.batches[:] = [merge_and_empty(state.batches)]  # each is freed when it has been copied
+        state.batches[:] = [merge_and_empty(state.batches)]  # each batch is freed when it has been copied
     return state.batches[0]
 
 

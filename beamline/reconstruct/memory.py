@@ -1,4 +1,6 @@
-"""The memory that a reconstruction needs, in one piece and in slabs, errors if it is too much, and remote workers."""
+"""Memory: how much of it a reconstruction needs, in one piece and in slabs; errors if it is too much; remote
+workers.
+"""
 
 from __future__ import annotations
 
@@ -27,12 +29,12 @@ from recon.error_bars import HALO, error_bars_memory
 from recon.judgement import judge_memory
 from recon.voxels.direct import Fbp
 
-SHARE = 0.7  # Share of the free memory that a reconstruction takes by default
+SHARE = 0.7  # default share of the free memory that a reconstruction may use
 
-_COPIES = 4  # float32 copies of a projection while it is corrected
+_COPIES = 4  # number of float32 copies of a projection while it is corrected
 _ROWS = 16  # number of slices that FBP makes together; the height of slabs is a multiple of it
 _NO_STEPS = StepMemory()
-_ASIDE = 64_000_000  # bytes for figures of merit, or for a step that runs alone, that are not counted
+_ASIDE = 64_000_000  # bytes that are not counted, for figures of merit or for a step that runs alone
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class ReconMemory:
         geometry: geometry of the binned projections of all scans.
         raw: memory of the pixels as they are read.
         steps: memory of the correction steps.
-        largest_step: name of the step that needs the most memory alone.
+        largest_step: name of the step that needs the most memory when it runs alone.
         bars: True if error bars are computed, too.
         reach: how far the sample goes beyond the field of view, for a method that reconstructs all of it; None: it is
             within the field of view.
@@ -75,13 +77,13 @@ class ReconMemory:
 
     @property
     def at_once(self) -> int:
-        """Memory with everything in memory at once."""
+        """Memory if the volume and all projections are in memory at once."""
         work = self._work(self.method, self.geometry, self._grid(self.rows))
         return self.raw + self.line_integrals + self.weights + max(work, self.steps.correcting, self._alone)
 
     @property
     def _alone(self) -> int:
-        """Memory of a step that runs alone, if it is more than the program itself needs."""
+        """Memory of a step that runs alone; 0 if it is less than `_ASIDE`, which is not counted."""
         return self.steps.alone if self.steps.alone > _ASIDE else 0
 
     @property
@@ -90,7 +92,9 @@ class ReconMemory:
         return (self.raw + _COPIES * self.line_integrals) // self.geometry.n_views
 
     def slab(self, height: int) -> int:
-        """Memory of a slab of `height` slices, with its projections and weights; figures of merit need less."""
+        """Memory of a slab of `height` slices, with its projections and weights. Figures of merit of a slab need
+        less.
+        """
         halo = self.method.halo
         seen = min(height + 2 * (max(halo, HALO) if self.bars else halo), self.rows)
         part = self.geometry.rows(0, seen)
@@ -108,7 +112,9 @@ class ReconMemory:
 
     @property
     def figures(self) -> int:
-        """Memory of the figures of merit for a volume on disk, without that of the program itself; FBP needs less."""
+        """Memory of the figures of merit for a volume on disk; 0 if it is less than `_ASIDE`, which is not counted. FBP
+        needs less.
+        """
         most = judge_memory(self.geometry, fitted=self.method.fitted)
         return most if most > _ASIDE else 0
 
@@ -119,7 +125,7 @@ class ReconMemory:
 
     @property
     def parts(self) -> dict[str, int]:
-        """Bytes of each part that must fit alone, by its name in an error."""
+        """Bytes of each part of the work that must fit into the memory alone, by the name of the part in an error."""
         views = f"{self.geometry.n_views} projections of {self.geometry.detector_shape[1]} columns"
         return {
             f"{self.method.name} of the smallest slab of {views}{' with weights' * self.weighted}": self.slab(_ROWS),
@@ -129,7 +135,7 @@ class ReconMemory:
         }
 
     def height(self, memory: int) -> int:
-        """Height of the largest slabs of equal height that fit into the memory, which must be at least `least`."""
+        """Height of the largest slabs of equal height that fit into `memory`. `memory` must be at least `least`."""
         for parts in range(1, self.rows // _ROWS + 2):
             height = math.ceil(self.rows / parts / _ROWS) * _ROWS
             if self.slab(height) <= memory:
@@ -142,7 +148,7 @@ class ReconMemory:
 
 
 def recon_memory_of(scan: SelectedScan, options: ReconOptions) -> ReconMemory:
-    """Memory for reconstructing the selected projections of a scan, before any frame is read.
+    """The memory to reconstruct the selected projections of a scan, estimated before any frame is read.
 
     Raises:
         ConfigError: the selection does not fit the scan.
@@ -164,7 +170,7 @@ def recon_memory_of(scan: SelectedScan, options: ReconOptions) -> ReconMemory:
 
 
 def memory_of(options: ReconOptions) -> int:
-    """Memory in bytes allowed for this process, and for each worker on this computer or Slurm job."""
+    """Memory in bytes that this process may use, and that each worker on this computer or in the Slurm job may use."""
     if options.memory is not None:
         return options.memory
     free = free_memory()
@@ -172,7 +178,7 @@ def memory_of(options: ReconOptions) -> int:
 
 
 def refuse_whole(scan: SelectedScan, options: ReconOptions, needs: ReconMemory, memory: int) -> None:
-    """Raise ConfigError for methods and options that need everything in memory."""
+    """Raise ConfigError if the method or an option needs everything in memory."""
     if options.method.volumes > 1:
         fewer = int(needs.rows * memory / needs.at_once)
         rows = f"--rows with {count(fewer, 'row')} or fewer at a time, or " if fewer else ""
@@ -210,7 +216,8 @@ def refuse_smallest(source: ScanSource, needs: ReconMemory, memory: int, binning
 
 
 def cluster(spec: str) -> AbstractContextManager[Any]:
-    """Workers that reconstruct slabs, of the add-on splatline-cluster: a context with `workers` and `reconstruct`.
+    """Workers of the add-on splatline-cluster that reconstruct slabs: a context manager with `workers` and
+    `reconstruct`.
 
     Args:
         spec: `local:N` for N workers on this machine, or `tcp://HOST:PORT` of a scheduler.

@@ -34,8 +34,9 @@ def report_beside(output: Path) -> Path:
 
 @dataclass(frozen=True)
 class OutputPaths:
-    """Paths of the results. report: None if no report is wanted. replace: overwrite older results. written: if False,
-    no volume is written, and the folder of `output` is only used for temporary files."""
+    """Paths of the results. report: None if the user does not want a report. replace: True: overwrite older results.
+    written: False: no volume is written, and the folder of `output` is used only for temporary files.
+    """
 
     output: Path
     report: Path | None
@@ -44,7 +45,7 @@ class OutputPaths:
 
     @property
     def partial(self) -> Path:
-        """The file with the finished slabs of a volume, until all slabs are finished."""
+        """The file that keeps the finished slabs of a volume until all slabs are finished."""
         return self.output.with_name(f"{self.output.stem}.partial.h5")
 
     @property
@@ -61,7 +62,7 @@ class OutputPaths:
             )
 
     def refuse_existing(self) -> None:
-        """Raise DataError before any work if a result exists, or its folder is not writable."""
+        """Raise DataError, before any work, if a result already exists or its folder is not writable."""
         if not self.replace:
             for path in (self.output, self.report):
                 if path is not None:
@@ -76,8 +77,8 @@ class OutputPaths:
             ) from error
 
     def require_room(self, n_bytes: int, meanwhile: int = 0) -> None:
-        """Raise DataError before any work if the disk has no room for a volume of `n_bytes` bytes and `meanwhile` bytes
-        of temporary files.
+        """Raise DataError, before any work, if the disk has no room for a volume of `n_bytes` bytes and temporary files
+        of `meanwhile` bytes.
         """
         free = shutil.disk_usage(self.output.parent).free
         if n_bytes + meanwhile > free:
@@ -97,8 +98,8 @@ class FollowTiming:
         poll: time between two readings of the file if there is nothing to fit.
         slice: time of fitting between two readings of the file.
         snapshot: time between two intermediate volumes.
-        picture: least time between two pictures of FBP slices; drawing takes at most half of the time.
-        patience: a scan counts as dead if its file has no lock and no new frame came for this time.
+        picture: shortest time between two pictures of FBP slices; drawing takes at most half of the time.
+        patience: a scan counts as dead if its file has no lock and no new frame was written for this time.
     """
 
     poll: float = 0.1
@@ -115,20 +116,21 @@ class ReconOptions:
     Attributes:
         method: the method with its settings. `R2.seconds` limits the whole call, or the time after the end of the scan
             if the scan is followed.
-        budget: time limit in s from line integrals to volume; `auto` does not try methods that would take longer.
+        budget: time limit in s from the line integrals to the volume; `auto` does not try methods that would take
+            longer.
         quality: a preset for the number of steps and Gaussians.
         filter: filter of the FBP that the volume is compared with.
         truth: ground truth for the comparison, as FILE or FILE:first:end.
-        unfinished: use the existing frames of a scan that is still running or died.
+        unfinished: True: use the existing frames of a scan that is still running or died.
         follow: settings for a scan that is still running; None for a finished scan.
         memory: bytes that the reconstruction may use; None: 70 % of the free memory.
         cluster: workers that reconstruct slabs, in the form of `--cluster`; None: this process does it.
         region: the box of the volume to reconstruct; None: the whole volume.
         partial: partial volume whose missing slabs are reconstructed; None: start from the beginning.
-        reference: an earlier volume of the same sample, or its scan, for a method that takes one.
-        uncertainty: also compute the standard deviation of each voxel, see `recon.error_bars`.
-        command: the command line of this call, which the file states.
-        recipe: the options that apply to any scan, as YAML, which the file states.
+        reference: an earlier volume of the same sample, or the scan of it, for a method that uses a reference.
+        uncertainty: True: also compute the standard deviation of each voxel, see `recon.error_bars`.
+        command: the command line of this call; it is written to the volume file.
+        recipe: the options that apply to any scan, as YAML; it is written to the volume file.
     """
 
     source: SourceOptions
@@ -158,7 +160,7 @@ class ReconOptions:
 
     @property
     def given(self) -> frozenset[str]:
-        """Names in `combinations.EXCLUDED` of what these options ask for."""
+        """What these options ask for, by its names in `combinations.EXCLUDED`."""
         asked = {
             "follow": self.follow, "budget": self.budget, "quality": self.quality, "reference": self.reference,
             "volumes": self.method.volumes > 1, "uncertainty": self.uncertainty, "truth": self.truth,
@@ -167,19 +169,19 @@ class ReconOptions:
         return frozenset(name for name, value in asked.items() if value not in (None, False))
 
     def disk_needs(self, volume: int, *, in_slabs: bool) -> tuple[int, int]:
-        """Bytes on disk for the result, and for temporary files, of a volume of `volume` bytes."""
+        """(bytes on disk for the result, bytes for temporary files), for a volume of `volume` bytes."""
         if not in_slabs:
             return volume * self.target.written * (1 + self.uncertainty), 0
         compared = self.target.report is not None and self.method.fitted
-        slabs = self.partial is None  # otherwise their file exists already
+        slabs = self.partial is None  # otherwise the file of the slabs already exists
         bars = self.uncertainty
         if not self.target.written:
             return 0, (slabs + compared + bars) * volume
         return (1 + bars) * volume, (slabs + compared + bars) * volume
 
     def around_region(self, scan: SelectedScan) -> tuple[ReconOptions, SelectedScan]:
-        """The options and the scan with the detector rows that show the region; unchanged if the whole volume is
-        wanted. If the region is the one around the sample, it is found first.
+        """The options and the scan, narrowed to the detector rows that show the region; unchanged if the options ask
+        for the whole volume. If the options ask for the region around the sample, the region is found first.
 
         Raises:
             ConfigError, DataError: see `region.rows_around` and `region.box_around_sample`.
@@ -205,7 +207,7 @@ class ReconOptions:
 
     @property
     def streaming(self) -> Fit:
-        """The method for a scan that is followed while it runs; only allowed if `streams` is True."""
+        """The method for a scan that is followed while it runs; may be used only if `streams` is True."""
         assert isinstance(self.method, Fit)
         return self.method
 

@@ -1,4 +1,4 @@
-"""Error model of a followed scan: how the error of its volume depends on the number of projections."""
+"""Pass laws: measures how the error of the volume of a followed scan depends on the number of projections."""
 
 from __future__ import annotations
 
@@ -17,22 +17,20 @@ from beamline.reconstruct.live_states import Cursor, Feeds, Following, WaitsForA
 from drivers.base.clock import Clock
 from recon.voxels.measured_law import measured_law
 
-_NOISE_FLATS = 8  # at most, which show the noise of a frame
+_NOISE_FLATS = 8  # largest number of flats from which the noise of a frame is measured
 _NO_GAIN = "The improvement by further projections is not predicted"
 
 
 class PassLaws:
-    """Measures at the end of each pass how the error of the volume depends on the number of projections (the law of the
-    error), once all usable projections until then are corrected.
-
-    If the next pass ends before the law of a pass is measured, this pass is left out, because only the newest law is
-    used.
+    """Measures, for each pass, how the error of the volume depends on the number of projections (the law of the error).
+    It measures as soon as all usable projections of the pass are corrected. If the next pass has already ended by then,
+    the law of this pass is not measured, because only the newest law is used.
     """
 
     def __init__(self, views: FollowedViews, seed: int, sink: Sink, clock: Clock, warn: Warnings) -> None:
         self._views, self._sink, self._clock, self._warn = views, sink, clock, warn
         self._rng = np.random.default_rng(seed)
-        self._end = 0  # rows of the file at the end of the last pass whose law was looked for
+        self._end = 0  # rows of the file up to the end of the newest pass that was looked at
 
     def look(self, state: Following, file: Cursor) -> None:
         """Measure and report the law at the end of the newest pass, unless this was done already.
@@ -48,7 +46,7 @@ class PassLaws:
         if (file.frames if missing else file.taken) < end:
             return
         self._end = end
-        if missing:  # a scan that waits for the law takes no frame that might show it
+        if missing:  # the scan waits for the law and takes no further frame, so no frame can show what is missing
             self._no_law(ends.size, 0, f"{missing} yet")
             return
         usable = {row for row in self._views.usable().frames.tolist() if row < end}
@@ -83,7 +81,7 @@ class PassLaws:
 
 
 def _missing(state: Following, file: Cursor) -> str:
-    """What keeps the projections of the file from being used; empty: nothing."""
+    """Why the projections of the file cannot be used; empty if they can."""
     if isinstance(state, WaitsForReferences) and file.behind:
         return "darks or flats have not been taken"
     if isinstance(state, WaitsForAxis) or state.axis_col is None:

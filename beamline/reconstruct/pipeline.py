@@ -1,5 +1,6 @@
-"""The pipeline: from options to a volume with its report. There are two sources of projections: a finished file, or a
-file that is still growing."""
+"""Pipeline: makes a volume and its report from options. The projections come from a finished file, or from a file that
+is still growing.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +61,7 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
     """Follow a running scan to its last projection with a growing fit; yields the job that makes its volume.
 
     Intermediate volumes are in `<output>.snapshot.h5`, their pictures in `<output>.live.png`. If the block fails, the
-    newest of both stay; otherwise only the picture stays.
+    newest volume and picture stay; otherwise only the picture stays.
 
     Raises:
         DataError: the file is not a scan, or it stopped growing without being finished.
@@ -87,12 +88,12 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
             last = follower.end()
 
         def facts() -> ScanFacts:
-            # Open it again, because HDF5 may still have the old texts, from before the scan ended.
+            # Open the file again, because HDF5 may still have the texts from before the end of the scan.
             picture = options.target.live_picture.name if follower.snapshots.drawn else ""
             with _open(options, channels, timing) as source:
                 return replace(facts_of(source), live_picture=picture)
 
-        phases = Phases(sink, clock)  # a new one, because waiting for projections does not count as work
+        phases = Phases(sink, clock)  # a new `Channels`, because waiting for projections does not count as work
         phases.enter("final fit")
         final_fit = follower.final_fit(last, options.streaming.seconds or MOST_SECONDS, timing.snapshot)
         channels = replace(channels, phases=phases)
@@ -103,7 +104,7 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
 def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: FollowTiming) -> ReconOptions:
     """Wait for the end of a scan whose method needs all projections; returns the options for the finished scan.
 
-    With a reference, pictures of the projections so far are drawn meanwhile.
+    If the method uses a reference, pictures of the projections so far are drawn during the wait.
 
     Raises:
         DataError: the scan died.
@@ -132,10 +133,9 @@ def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: Follow
 
 
 def _compile(options: ReconOptions, channels: Channels, timing: FollowTiming) -> None:
-    """Compile the kernels of the fit (only once on a computer) before the first projection. Those of the voxel
-    refinement are compiled after the last projection.
-
-    The event `ready` then says where the volume can be watched.
+    """Compile the kernels of the fit before the first projection (only once on a computer). Then send the event
+    `ready`, which names the picture that shows the volume. The kernels of the voxel refinement are compiled after the
+    last projection.
     """
     sink, clock = channels.sink, channels.clock
     compiled = compilation_events(sink, clock)
@@ -166,8 +166,8 @@ def _open(options: ReconOptions, channels: Channels, timing: FollowTiming) -> Sc
 
 
 def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_stop: Callable[[], bool]) -> bool:
-    """Read projections and fit, in turns. Returns True when the scan has ended, and False after a stop with enough
-    projections for a volume.
+    """Read projections and fit, in turns. Returns True when the scan has ended, and False after a stop request, if
+    there are enough projections for a volume.
 
     Raises:
         DataError: the scan died.
@@ -249,7 +249,8 @@ def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
 def _for_method(
     options: ReconOptions, prepared: PreparedProjections, plan: ReconPlan, channels: Channels
 ) -> PreparedProjections:
-    """The projections as the method needs them, some of them held out if it may end early. Also checks the disk space.
+    """The projections in the form that the method needs. Some are held out if the method may end early. The function
+    also checks the disk space.
 
     Raises:
         ConfigError, DataError: there are too few projections, or too little disk space.
@@ -264,10 +265,8 @@ def _for_method(
         )
     if options.method.stops_early and not prepared.lines.held_out.size:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
-        n = prepared.n_used
-        message = (
-            f"{prepared.n_projections - n} of {prepared.n_projections} projections are held out to decide when to stop"
-        )
+        n, of = prepared.n_used, prepared.origin.n_projections
+        message = f"{of - n} of {of} projections are held out to decide when to stop"
         channels.sink(StateEntered("held_out", message, time=channels.clock.now()))
     options.target.require_room(plan.output, plan.scratch - plan.line_integrals)  # line integrals are stored already
     return prepared
@@ -275,13 +274,13 @@ def _for_method(
 
 def _announce(options: ReconOptions, prepared: PreparedProjections, channels: Channels) -> None:
     """Report the corrections that were applied, then send the event `recon_started`."""
-    sink, clock = channels.sink, channels.clock
-    corrections_done({name: done.sentence for name, done in prepared.done.items() if not done.warned}, sink, clock)
-    views, confident = prepared.geometry, None if prepared.axis is None else prepared.axis.confident
-    more = {"n_projections": prepared.n_projections, "detector": views.detector_shape, "axis_confident": confident}
+    sink, clock, origin = channels.sink, channels.clock, prepared.origin
+    corrections_done({name: done.sentence for name, done in origin.done.items() if not done.warned}, sink, clock)
+    views, confident = prepared.geometry, None if origin.axis is None else origin.axis.confident
+    more = {"n_projections": origin.n_projections, "detector": views.detector_shape, "axis_confident": confident}
     sink(
         ReconStarted(
-            options.source.path, options.method.name, views.n_views, prepared.axis_col, more=more, time=clock.now()
+            options.source.path, options.method.name, views.n_views, origin.axis_col, more=more, time=clock.now()
         )
     )
 
@@ -292,16 +291,18 @@ def reconstruct_file(
     """Reconstruct a finished or running scan. Returns the record of the volume, as in the event `done`.
 
     If the reconstruction is stopped within `stop_scope`, the volume reached so far is written and marked `ended_early`.
-    A direct method is interrupted instead, and writes nothing; a reconstruction in slabs keeps the finished slabs.
+    There are two exceptions: a direct method is interrupted and writes nothing, and a reconstruction in slabs is
+    interrupted and keeps the finished slabs.
 
     While a scan is running, intermediate volumes are in `<output>.snapshot.h5`, and their pictures in
-    `<output>.live.png`. Each replaces the one before in one step. After a failure the newest of both stay; after
-    success only the picture stays.
+    `<output>.live.png`. Each file replaces the last one in one step. After a failure the newest volume and picture
+    stay; after success only the picture stays.
 
     Raises:
-        ConfigError, DataError: nothing was written. Also for a scan that stopped growing without being finished.
-        ScanStopped: interrupted; the finished slabs can be continued.
-        KeyboardInterrupt: stopped before a running scan had a volume.
+        ConfigError, DataError: the reconstruction is not possible, or a growing scan stopped without being finished;
+            nothing was written.
+        ScanStopped: the user interrupted the reconstruction; it can be continued from the finished slabs.
+        KeyboardInterrupt: the user stopped before there was a volume of the running scan.
     """
     channels = Channels(
         sink, clock, Warnings(sink, clock), Phases(sink, clock), stop_scope, clock.now(), time.process_time()
@@ -309,7 +310,7 @@ def reconstruct_file(
     truth_given = refuse_before_reading(options)
     if options.reference is not None:
         first = partial(reconstruct_file, clock=clock, stop_scope=stop_scope)
-        if options.follow is not None:  # a scan waits for this
+        if options.follow is not None:  # a running scan waits for this event
             shown = f"Pictures of the scan will be in {options.target.live_picture}, from the eighth projection on"
             picture = {"picture": options.target.live_picture}
             sink(StateEntered("ready", shown, picture, time=clock.now()))
@@ -335,7 +336,7 @@ def reconstruct_file(
             recipe=options.recipe, region=job.region, phases=job.channels.phases, leaves=job.leaves,
             filter=options.filter,
         )  # fmt: skip
-        with job.stopping():  # the volume is there: the first signal no longer discards it
+        with job.stopping():  # the volume is complete: the first signal no longer discards it
             record = write_result(MadeVolume(made, prepared, truth, options.target, context), sink, clock)
-        del made, prepared  # Windows removes no file that is mapped
+        del made, prepared  # Windows does not remove a file that is mapped
     return record

@@ -1,6 +1,5 @@
-"""Plans a reconstruction: memory, disk space and slabs, and raises an error if memory or disk space are not enough.
-
-A run follows the plan that its dry run states.
+"""Plan: plans memory, disk space and slabs of a reconstruction, and raises an error if memory or disk space is not
+enough. The run follows the same plan that the dry run states.
 """
 
 from __future__ import annotations
@@ -61,10 +60,10 @@ class ReconPlan(Need):
     """How a reconstruction uses memory and disk.
 
     Attributes:
-        needs: memory needs, as far as they are known.
+        needs: memory needs, as far as they are known so far.
         allowed: bytes of memory that may be used.
         slabs: the slabs in which the volume is reconstructed; empty: in one piece.
-        missing: slabs that a partial volume does not have yet; without one, all slabs.
+        missing: slabs that a partial volume does not have yet; all slabs if there is no partial volume.
     """
 
     needs: ReconMemory
@@ -85,7 +84,7 @@ def planned(scan: SelectedScan, options: ReconOptions, needs: ReconMemory) -> Re
         needs: result of `recon_memory_of`.
 
     Raises:
-        ConfigError: an option needs more memory than there is.
+        ConfigError: an option needs more memory than may be used.
         DataError: the smallest slab does not fit, a cone-beam volume does not fit in one piece, or there are slabs of
             an earlier call.
     """
@@ -104,7 +103,8 @@ def planned(scan: SelectedScan, options: ReconOptions, needs: ReconMemory) -> Re
         )
     refuse_whole(scan, options, needs, allowed)
     turned = scan.selection.step(TiltAndLens).of(scan) is not None
-    needs = replace(needs, weighted=turned and options.method.weighs)  # other weights are not known yet
+    # whether other weights are needed is not known yet
+    needs = replace(needs, weighted=turned and options.method.weighs)
     return _in_slabs(source, options, needs, allowed)
 
 
@@ -112,19 +112,21 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
     """The plan for the projections after they were read.
 
     Args:
-        plan: the plan from before they were read.
+        plan: the plan that was made before the projections were read.
 
     Raises:
-        DataError: the volume does not fit into the memory, because its axis was found near an edge.
+        DataError: the volume does not fit into the memory, because the axis was found near an edge of the detector, or
+            the sample extends beyond the field of view, or the rays need weights.
     """
     geometry = prepared.geometry
-    method, shares = options.method, prepared.shares
-    differ = not plan.slabs or prepared.views.weights is not None or prepared.shares_of is not None
+    method, shares = options.method, prepared.sources.shares
+    differ = not plan.slabs or prepared.views.weights is not None or prepared.sources.shares_of is not None
     weighted, reach = differ if method.weighs else shares is not None, prepared.lines.reach
     needs = ReconMemory(
         options.method_for(geometry), geometry, 0, weighted, bars=options.uncertainty,
         reach=reach if method.knows_outside else None,
-        weights=0 if shares is None else shares.nbytes * (1 + (not plan.slabs)),  # of parts of views, and of all rays
+        # the weights of parts of views, and those of all rays
+        weights=0 if shares is None else shares.nbytes * (1 + (not plan.slabs)),
     )  # fmt: skip
     more = "The sample extends beyond the field of view" if needs.reach is not None and needs.reach.is_outside else ""
     more = more or "Some pixels have no data, so each ray needs a weight" * bool(needs.weights)
@@ -136,18 +138,20 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
         )
     if plan.slabs or (more and method.volumes == 1 and needs.at_once > plan.allowed):
         return _in_slabs(source, options, needs, plan.allowed)
-    if not geometry.is_cone and prepared.axis is not None and needs.at_once > plan.allowed:
+    axis_col = prepared.origin.axis_col
+    if not geometry.is_cone and prepared.origin.axis is not None and needs.at_once > plan.allowed:
         raise DataError(
-            f"{source.path}: not enough memory. The rotation axis (column {prepared.axis_col:.2f}) is off the detector "
+            f"{source.path}: not enough memory. The rotation axis (column {axis_col:.2f}) is off the detector "
             f"middle, so the volume of the 360° scan needs {size(needs.at_once)}, but {size(plan.allowed)} is allowed. "
-            f"Add --axis {prepared.axis_col:.2f}: the volume is then reconstructed in slabs. Nothing was written."
+            f"Add --axis {axis_col:.2f}: the volume is then reconstructed in slabs. Nothing was written."
         )
     return _plan(options, needs, plan.allowed)
 
 
 def refuse_geometry(scan: SelectedScan, options: ReconOptions, plan: ReconPlan, geometry: Geometry) -> None:
-    """Raise DataError or ConfigError if the geometry of all projections does not allow the reconstruction, once the
-    axis is known."""
+    """Raise DataError or ConfigError if the geometry of all projections, with the known axis, does not allow the
+    reconstruction.
+    """
     _refuse_views(scan.source, options, geometry)
     _refuse_region(options, geometry)
     if options.method.volumes > 1:
@@ -163,7 +167,7 @@ def refuse_geometry(scan: SelectedScan, options: ReconOptions, plan: ReconPlan, 
 
 
 def _refuse_views(source: ScanSource, options: ReconOptions, geometry: Geometry) -> None:
-    """Raise DataError and ConfigError for views that are too few."""
+    """Raise DataError or ConfigError if there are too few views."""
     volumes, least = options.method.volumes, options.method.least_views
     if volumes * least > geometry.n_views:
         raise DataError(
@@ -176,13 +180,13 @@ def _refuse_views(source: ScanSource, options: ReconOptions, geometry: Geometry)
 
 
 def _refuse_region(options: ReconOptions, geometry: Geometry) -> None:
-    """Raise ConfigError for a region that lies outside the volume."""
+    """Raise ConfigError if the region lies outside the volume."""
     if isinstance(options.region, Region):
         locate(options.region, options.selection, geometry)
 
 
 def _in_slabs(source: ScanSource, options: ReconOptions, needs: ReconMemory, allowed: int) -> ReconPlan:
-    """The slabs for which the memory suffices, or those of a partial volume."""
+    """The slabs of the partial volume if there is one, otherwise slabs for which the memory suffices."""
     refuse_smallest(source, needs, allowed, options.selection.binning)
     slices, partial = Grid.matching(needs.geometry).shape[0], options.partial
     if partial is None:
@@ -224,8 +228,10 @@ def _plan(
 def prepare_within(
     scan: SelectedScan, options: ReconOptions, sink: Sink, clock: Clock, warn: Warn, phases: Phases | None = None
 ) -> tuple[PreparedProjections, ReconPlan]:
-    """`prepare_projections`, and the plan: for a volume made in slabs, line integrals are stored on disk."""
-    require_usable(scan)  # faults of the projections are told before those of options
+    """Call `prepare_projections` and make the plan. If the volume is made in slabs, the line integrals are stored on
+    disk.
+    """
+    require_usable(scan)  # errors of the projections are raised before errors of the options
     needs = recon_memory_of(scan, options)
     plan, buffer = planned(scan, options, needs), None
     options.target.require_room(plan.output, plan.scratch)
@@ -287,7 +293,7 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
     if options.cluster is not None:
         workers = cluster(options.cluster)
         if not local_workers(options.cluster):
-            with workers:  # which a scheduler has, or ConfigError
+            with workers:  # raises ConfigError if a scheduler does not have them
                 pass
     truth = None if options.truth is None else read_truth(options.truth)
     if options.follow is None:
@@ -299,7 +305,7 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
 
 
 def _refuse_contradictions(options: ReconOptions) -> None:
-    """Raises ConfigError for options that exclude each other, and for a file that cannot hold several volumes."""
+    """Raise ConfigError for options that exclude each other, and for a file that cannot contain several volumes."""
     if (found := contradiction(options.given)) is not None:
         raise ConfigError(f"{found.name} cannot be combined with {found.other}: {found.why}. Nothing was computed.")
     target = options.target
@@ -310,7 +316,7 @@ def _refuse_contradictions(options: ReconOptions) -> None:
 
 
 def _refuse_unfollowed(options: ReconOptions) -> None:
-    """Raises ConfigError for a method or views that a growing scan cannot have."""
+    """Raise ConfigError for a method, or a choice of views, that cannot be used for a growing scan."""
     if not options.streams:
         return
     method, views = options.streaming, options.selection.views
@@ -326,8 +332,9 @@ def _refuse_unfollowed(options: ReconOptions) -> None:
 
 
 def _refuse_file(source: ScanSource, options: ReconOptions) -> None:
-    """Raises DataError for an unfinished scan, unless it is to be taken as it is, and if a chunk of its file cannot
-    be unpacked in the memory."""
+    """Raise DataError in two cases: the scan is not finished and the options do not allow this, or a chunk of its file
+    does not fit into the memory when it is unpacked.
+    """
     if not (source.finished or options.unfinished):
         raise DataError(
             f"{source.path} is not finished. {next_step(source.path)} To use the {len(source.table)} frames recorded "
@@ -342,7 +349,7 @@ def _refuse_file(source: ScanSource, options: ReconOptions) -> None:
 
 
 def _check_device(device: str) -> None:
-    """Raises ConfigError if methods cannot compute on the device."""
+    """Raise ConfigError if methods cannot compute on the device."""
     try:
         backend_for(device)
     except (ImportError, RuntimeError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Writes the result of a reconstruction: the volume file, then the report with its figures of merit."""
+"""Record: writes the result of a reconstruction: the volume file, then the report with its figures of merit."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ from recon.voxels import view_weights
 
 
 def arrays_of_model(gaussians: Gaussians, geometry: Geometry) -> dict[str, Any]:
-    """The arrays of a model for a file, by name: physical values, so that other programs need not know the
-    parametrisation.
+    """The arrays of a model as they are written to a file, by name. They are physical values, so that other programs
+    need not know how the fit parametrises them.
     """
     return {
         "kernel": gaussians.kernel.value,
@@ -63,7 +63,7 @@ def write_result(made: MadeVolume, sink: Sink, clock: Clock) -> ReconRecord:
 
     Raises:
         DataError: the volume could not be written; no incomplete file remains. If only the report fails, a warning is
-            given.
+            given instead.
     """
     phases, target, ordinary = made.context.phases, made.target, replace(made, prepared=made.prepared.centred)
     phases.enter("checking the volume")
@@ -74,12 +74,12 @@ def write_result(made: MadeVolume, sink: Sink, clock: Clock) -> ReconRecord:
     phases.enter("writing the volume")
     if target.written:
         write_volume(target.output, record, replace=target.replace)
-    state_time: Callable[[float], None] | None = None  # on the page
+    state_time: Callable[[float], None] | None = None  # writes the time on the page
     if target.report is not None:
         phases.enter("report")
         try:
             state_time = _report(replace(ordinary, context=context), checked, volumes, record.parameters)
-        except Exception as error:  # the volume stands, whatever its page lacks
+        except Exception as error:  # the volume is complete, even if its page is not
             sentence = f"No report was written ({type(error).__name__}: {error}). The volume is complete."
             sink(Warned(sentence, time=clock.now()))
             record = replace(record, report=None, warnings=(*record.warnings, sentence))
@@ -87,7 +87,8 @@ def write_result(made: MadeVolume, sink: Sink, clock: Clock) -> ReconRecord:
     elapsed = clock.now() - context.started
     if state_time is not None:
         state_time(elapsed)
-    record = replace(record, elapsed=elapsed, times=phases.seconds)  # reads the voxels, so that it comes first
+    # this reads the voxels, so it comes before they are moved to files
+    record = replace(record, elapsed=elapsed, times=phases.seconds)
     record = _with_voxels_in_files(record, target)
     sink(VolumeDone(record, time=clock.now()))
     return record
@@ -96,8 +97,8 @@ def write_result(made: MadeVolume, sink: Sink, clock: Clock) -> ReconRecord:
 def _report(
     made: MadeVolume, checked: CheckedVolume, volumes: Mapping[str, Volume], parameters: Mapping[str, Value]
 ) -> Callable[[float], None]:
-    """Write the page; what is returned states on it how long the whole command took, in s."""
-    from beamline.reconstruct.report import compose  # here: matplotlib takes a second
+    """Write the page. Returns a function that writes on the page how long the whole command took (in s)."""
+    from beamline.reconstruct.report import compose  # imported here, because matplotlib takes a second
     from beamline.report.html import write_report, write_timed
 
     target = made.target
@@ -109,7 +110,9 @@ def _report(
 
 
 def _record(made: MadeVolume, checked: CheckedVolume, now: float) -> tuple[ReconRecord, dict[str, Volume]]:
-    """The record of the volume, and the volumes of the report by method; of a region where one is wanted."""
+    """The record of the volume, and the volumes of the report by method. If the options ask for a region, they are
+    those of the region.
+    """
     result, prepared, target, context = made.result, made.prepared, made.target, made.context
 
     def written(volume: Volume) -> Volume:
@@ -118,7 +121,7 @@ def _record(made: MadeVolume, checked: CheckedVolume, now: float) -> tuple[Recon
     volumes = {method: written(volume) for method, volume in checked.volumes.items()}
     record = ReconRecord(
         volume=volumes[result.method],
-        length_unit=prepared.length_unit,
+        length_unit=prepared.origin.length_unit,
         raw_file=str(context.facts.path.resolve()),
         title=_title(result, context),
         sample=context.facts.sample or "not stated",
@@ -148,7 +151,9 @@ def _title(result: Reconstruction, context: ReportContext) -> str:
 
 
 def _with_voxels_in_files(record: ReconRecord, target: OutputPaths) -> ReconRecord:
-    """A copy of the record whose arrays are read from its files; without files, one with its volumes alone."""
+    """A copy of the record whose voxels are read from its file when they are used. If no file is written, the copy
+    contains the volume in memory.
+    """
     volume, series = record.volume, record.series
     if target.written:
         at = None if series is None else 0
@@ -157,12 +162,12 @@ def _with_voxels_in_files(record: ReconRecord, target: OutputPaths) -> ReconReco
         if series is not None:
             series = replace(series, data=VoxelsInFile(series.data.shape, partial(_dataset, target.output)))
     else:
-        volume = replace(volume, data=np.array(volume.data))  # it may lie in a temporary file
+        volume = replace(volume, data=np.array(volume.data))  # the volume may lie in a temporary file
     return replace(record, volume=volume, series=series, deviation=None, change=None, displacement=None, model={})
 
 
 def _voxels(path: Path, index: int | None, part: Any) -> NDArray[np.float32]:
-    """Part [z, y, x] of the volume of a file, or of its volume number `at`."""
+    """Part [z, y, x] of the volume of a file; if the file has several volumes, of volume number `index`."""
     with opened_volume(path, at=index) as stored:
         return np.array(stored.volume.data[part])
 
@@ -176,24 +181,24 @@ def parameters_of(made: MadeVolume) -> dict[str, Value]:
     """All parameters of the volume, by name."""
     result, prepared, context = made.result, made.prepared, made.context
     selection, geometry, facts = context.selection, prepared.geometry, context.facts
-    done, cols = recorded(in_order(selection), prepared.done), geometry.detector_shape[1]
+    done, cols = recorded(in_order(selection), prepared.origin.done), geometry.detector_shape[1]
     parameters: dict[str, Value] = {
         "method": result.method,
-        "axis_col": prepared.axis_col,
-        **_axis_parameters(prepared.axis),
+        "axis_col": prepared.origin.axis_col,
+        **_axis_parameters(prepared.origin.axis),
         "views": selection.views,
         "view_frames": prepared.ids,
         "view_angles_deg": np.degrees(geometry.angles),
         "n_views": geometry.n_views,
-        "n_projections": prepared.n_projections,
-        "views_left_out": prepared.left_out,
+        "n_projections": prepared.origin.n_projections,
+        "views_left_out": prepared.origin.left_out,
         "rows": "all" if selection.rows is None else f"{selection.rows[0]}:{selection.rows[1]}",
         **_region_parameters(context),
         "binning": selection.binning,
         "pixel_pitch": geometry.pixel_pitch,
-        "pixel_pitch_unit": prepared.length_unit,
+        "pixel_pitch_unit": prepared.origin.length_unit,
         **(cone_facts((geometry.sod, geometry.sdd), geometry.pixel_pitch, cols) if geometry.is_cone else {}),
-        "quantity": prepared.quantity,
+        "quantity": prepared.origin.quantity,
         **done,
         **_pose_parameters(geometry),
         "floored_fraction": float(prepared.corrected.floored),
@@ -209,8 +214,8 @@ def parameters_of(made: MadeVolume) -> dict[str, Value]:
     parts = np.unique(prepared.corrected.unmeasured[:, 0]), prepared.unmeasured_rows[0]
     unmeasured = zip(("frames_unmeasured_in_part", "rows_unmeasured"), parts, strict=True)
     parameters |= {name: numbers for name, numbers in unmeasured if numbers.size}
-    if prepared.view_weights is not None:
-        parameters["view_weights"] = prepared.view_weights
+    if prepared.sources.of_views is not None:
+        parameters["view_weights"] = prepared.sources.of_views
     if facts.frames_per_view > 1:
         parameters["frames_per_view"] = facts.frames_per_view
     texts = {"columns": facts.columns, "scan_ended": facts.ended, "recipe": context.recipe}
@@ -218,7 +223,7 @@ def parameters_of(made: MadeVolume) -> dict[str, Value]:
 
 
 def _pose_parameters(geometry: Geometry) -> dict[str, Value]:
-    """Where views were displaced, rolled or tilted, and slices that few views see."""
+    """How views were displaced, rolled or tilted, and which slices few views see, as parameters by name."""
     parameters: dict[str, Value] = {}
     if geometry.shifts.any():
         parameters["view_shifts_px"] = geometry.shifts
@@ -259,7 +264,7 @@ def _region_parameters(context: ReportContext) -> dict[str, Value]:
 
 
 def _flat(prefix: str, values: Mapping[str, Any]) -> dict[str, Value]:
-    """Nested settings by joined names; values without an HDF5 type become text."""
+    """Nested settings as one level, with joined names; values without an HDF5 type become text."""
     out: dict[str, Value] = {}
     for key, value in values.items():
         name = f"{prefix}_{key}" if prefix else key

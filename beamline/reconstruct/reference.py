@@ -37,18 +37,19 @@ def with_reference(
 ) -> ReconOptions:
     """The options with the reference volume as a setting of the method. A scan is reconstructed first, with `auto`.
 
-    That volume is in `<name of the scan>_reference.h5` beside the output, or in the folder of the series that the run
-    of the output belongs to, and later calls use it again. If the state
-    has fewer than 16 projections, no scan is reconstructed, because the method cannot test whether a reference helps.
+    The volume is written to `<name of the scan>_reference.h5` next to the output; if the output belongs to a run of a
+    series, it is written to the folder of the series. Later calls use it again. If the state has fewer than 16
+    projections, the scan is not reconstructed, because the method cannot test whether a reference helps.
 
     Raises:
-        DataError: the file is neither a volume of attenuation nor a scan, a voxel is not finite, or the output has
-            the name of the reference's volume.
+        DataError: the file is neither a volume of attenuation nor a scan, a voxel is not finite, or the output and the
+            volume of the reference have the same name.
         ScanStopped: the reconstruction of the reference was stopped; its volume was removed.
     """
     if volume_format(path) is None:
         folder = options.target.output.parent
-        folder = folder.parent if is_series_folder(folder.parent) else folder  # one for all states of a series
+        # one reference for all states of a series
+        folder = folder.parent if is_series_folder(folder.parent) else folder
         made = folder / f"{safe_name(path.stem)}_reference.h5"
         if made == options.target.output:
             raise DataError(
@@ -56,14 +57,14 @@ def with_reference(
                 "Name another output. Nothing was computed."
             )
         if _too_few(options):
-            return options  # the method says so, and does not look at a reference
+            return options  # the method reports this, and does not use a reference
         if not made.exists():
             said = f"The reference {path.name} is a scan: it is reconstructed first, into {made.name}"
             sink(StateEntered("reference", said, {"reference": made}, time=clock.now()))
             target, source = OutputPaths(made, None), SourceOptions(path)
             first = ReconOptions(source, target, Selection(), Auto(), seed=options.seed, memory=options.memory)
             record = reconstruct(first, lambda event: None if isinstance(event, VolumeDone) else sink(event))
-            if record.ended_early:  # later calls would use a poor reference
+            if record.ended_early:  # a reference that ended early is poor, and later calls would use it
                 made.unlink()
                 raise ScanStopped(
                     f"The reconstruction of the reference {path.name} was stopped, so its volume {made} was removed. "

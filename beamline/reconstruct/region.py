@@ -25,12 +25,13 @@ Span = tuple[int, int]
 
 @dataclass(frozen=True)
 class Region:
-    """A box of voxels, first:end along z, y and x, of the whole volume with the same options.
+    """A box of voxels, first:end along z, y and x. The numbers are those of the whole volume made with the same
+    options.
 
     Attributes:
         requested: True if the user gave this box; a box that extends beyond the volume is then an error. False if the
             box was found; it is then clipped to the volume.
-        reason: a sentence on a box that was found.
+        reason: a sentence that says how the box was found.
     """
 
     z: Span
@@ -61,12 +62,12 @@ class AroundSample:
 
 @dataclass(frozen=True)
 class RegionOfRows:
-    """A region, relative to the volume of the rows that are read for it.
+    """A region, and its place in the volume of the detector rows that are read for it.
 
     Attributes:
-        region: in the whole volume.
-        slices: the same slices (z, y, x) of the volume of these rows.
-        z_offset: mm from z = 0 of all rows up to z = 0 of these rows.
+        region: the region in the whole volume.
+        slices: the region as slices (z, y, x) of the volume of these rows.
+        z_offset: height in mm of z = 0 of these rows above z = 0 of all rows.
     """
 
     region: Region
@@ -78,7 +79,9 @@ class RegionOfRows:
         return grid.part(*self.slices)
 
     def cut(self, volume: Volume) -> Volume:
-        """Crop the region from a volume of these rows, or of its own box, in the frame of all rows."""
+        """Crop a volume of these rows to the region. A volume that already has the box of the region is not cropped. In
+        both cases z refers to all rows.
+        """
         grid, data = volume.grid, volume.data
         if grid.shape != tuple(part.stop - part.start for part in self.slices):
             grid, data = self.grid_of(grid), data[self.slices]
@@ -87,12 +90,13 @@ class RegionOfRows:
 
 
 def rows_around(scan: SelectedScan, region: Region, halo: int) -> SelectedScan:
-    """The scan with only the rows that show the region and a margin of `halo` slices; the axis is that of all
-    rows.
+    """The scan with only the rows that show the region and a margin of `halo` slices. The axis is that of the scan with
+    all rows.
 
     Raises:
-        ConfigError: a cone beam, a region beyond the rows or the widest volume, or options that may tilt projections or
-            move them along the axis. `locate` raises the errors that only the projections show.
+        ConfigError: the beam is a cone, the region extends beyond the rows or beyond the widest volume, or options may
+            tilt projections or move them along the axis. `locate` raises the errors that can be found only in the
+            projections.
     """
     selection = scan.selection
     if selection.cone is not None:
@@ -145,16 +149,15 @@ def locate(region: Region, selection: Selection, geometry: Geometry) -> RegionOf
 
 
 def _refuse_beyond(region: Region, width: int, whose: str) -> None:
-    """Raise ConfigError for voxels beyond a volume that is `width` voxels wide."""
+    """Raise ConfigError if the region extends beyond a volume that is `width` voxels wide."""
     for name, (first, end) in (("y", region.y), ("x", region.x)):
         if end > width:
             raise ConfigError(f"--roi {region}: {name} {first}:{end} does not lie within {whose} range 0:{width}.")
 
 
 def _widest(scan: SelectedScan) -> int:
-    """Largest width of the volume in voxels, before anything is read.
-
-    An axis that is still to be found may stand at an edge of the detector, and so may that of a sample that jumped.
+    """Largest width that the volume can have, in voxels, before anything is read. If the axis must still be found, or
+    the sample jumped, the axis may lie at an edge of the detector.
     """
     source, selection, flags = scan.source, scan.selection, scan.source.table.flags
     moved = selection.step(Preparation).judged or (flags is not None and bool(flags.flagged.any()))
@@ -163,15 +166,16 @@ def _widest(scan: SelectedScan) -> int:
     return Grid.matching(selection.geometry(selection.axis_col, np.zeros(1))).shape[2]
 
 
-_VIEWS = 72  # looked at, or up to twice as many
-_COLUMNS = 192  # that they are binned to, or up to twice as many
-_EDGE = 0.04  # share of the columns, on either side, that show air
-_NOISE, _SHARE = 6.0, 0.01  # deviations of the air's pixels, and share of the deepest line integrals: less is air
-_DEEPEST = 99.5  # percentile of the line integrals
-_SEEN = 0.2  # share of the views that show matter in a row with matter
-_WITHIN = 0.9  # share of the views in whose shadow a voxel of the sample lies; all, except for noise
-_BANDS = 24  # of rows, whose shadows are taken together
-_MARGIN, _COARSE = 0.04, 2  # of the volume's side; coarse voxels
+_VIEWS = 72  # number of projections that are used, or up to twice as many
+_COLUMNS = 192  # number of columns to which they are binned, or up to twice as many
+_EDGE = 0.04  # share of the columns, on either side, that are taken as air
+# limits below which a line integral is air: in standard deviations of the air; as a share of the deepest line integrals
+_NOISE, _SHARE = 6.0, 0.01
+_DEEPEST = 99.5  # percentile of the line integrals that counts as the deepest
+_SEEN = 0.2  # share of the views that must show material in a row with material
+_WITHIN = 0.9  # share of the views in whose shadow a voxel of the sample must lie; not 1, because of noise
+_BANDS = 24  # number of bands of rows; the shadows of the rows of a band are joined
+_MARGIN, _COARSE = 0.04, 2  # margin as a share of the volume's side; margin in coarse voxels
 
 
 def box_around_sample(scan: SelectedScan) -> Region:
@@ -184,7 +188,8 @@ def box_around_sample(scan: SelectedScan) -> Region:
     box is the whole volume, and the sentence states the reason.
 
     Raises:
-        ConfigError: the scan has a cone beam. DataError: no projection shows a sample.
+        ConfigError: the scan has a cone beam.
+        DataError: no projection shows a sample.
     """
     source, selection = scan.source, scan.selection
     if selection.cone is not None:
@@ -198,11 +203,12 @@ def box_around_sample(scan: SelectedScan) -> Region:
     views = f"every:{every}" if selection.views == "all" else selection.views
     unlearnt = (type(step)() for step in geometry_steps(selection))
     look = scan.selecting(replace(selection.asked, views=views, binning=side * coarse).with_steps(*unlearnt))
-    prepared = prepare_projections(look, lambda warning: None)  # they come again, of the views used
+    # the same warnings are given again when the projections are prepared for the volume
+    prepared = prepare_projections(look, lambda warning: None)
     data, geometry = prepared.seen.data, prepared.geometry
-    grid = Grid.matching(selection.geometry(prepared.axis_col, geometry.angles))
+    grid = Grid.matching(selection.geometry(prepared.origin.axis_col, geometry.angles))
     across = grid.shape[2]
-    # Edges of matter do not show the air, from which matter in any row would rise.
+    # If material extends to the edges, they do not show air. The limit for air would then be too high in all rows.
     if cut := reach_of(prepared.seen).beyond:
         where = " and the ".join(cut)
         return _uncut(
@@ -237,7 +243,9 @@ def _uncut(height: int, across: int, why: str) -> Region:
 
 
 def _least(data: F32) -> float:
-    """Line integral above which a mean of nine pixels is matter, from those of the air at the edges."""
+    """Line integral above which the mean of nine pixels counts as material. It follows from the line integrals of the
+    air at the edges.
+    """
     cols = max(2, round(_EDGE * data.shape[2]))
     edges = np.stack([data[..., :cols], data[..., -cols:]])
     air = np.median(edges)
@@ -246,7 +254,7 @@ def _least(data: F32) -> float:
 
 
 def _hull(material: Mask, geometry: Geometry, grid: Grid, coarse: int) -> Mask:
-    """[y, x] coarse voxels of the grid that are in the shadow of most views, in some band of rows."""
+    """[y, x], True for coarse voxels of the grid that lie in the shadow of most views in at least one band of rows."""
     cols = np.arange(material.shape[2])
     n = -(-grid.shape[2] // coarse)
     at = (grid.coordinates()[2][0] / grid.voxel_size + (coarse - 1) / 2 + coarse * np.arange(n)) / coarse
@@ -255,7 +263,7 @@ def _hull(material: Mask, geometry: Geometry, grid: Grid, coarse: int) -> Mask:
         shadow = material[:, band].any(axis=1)
         first = np.where(shadow, cols, cols.size).min(axis=1)
         last = np.where(shadow, cols, -1).max(axis=1)
-        # A shadow at the edge may continue beyond it; a view without any does not say where the sample is.
+        # A shadow at the edge may continue beyond it. A view without a shadow does not show the position of the sample.
         unknown = last < 0
         low = np.where((first <= 1) | unknown, -np.inf, first - 1 - geometry.axis_col)
         high = np.where((last >= cols.size - 2) | unknown, np.inf, last + 1 - geometry.axis_col)
@@ -268,7 +276,7 @@ def _hull(material: Mask, geometry: Geometry, grid: Grid, coarse: int) -> Mask:
 
 
 def _extent(positions: NDArray[np.intp], coarse: int) -> Span:
-    """Fine voxels from the first to the last of these coarse ones."""
+    """The range of fine voxels from the first to the last of these coarse voxels."""
     return int(positions[0]) * coarse, (int(positions[-1]) + 1) * coarse
 
 

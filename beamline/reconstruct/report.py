@@ -1,4 +1,4 @@
-"""The content of the report of a reconstruction: scan, settings, figures of merit, pictures."""
+"""Report: composes the report of a reconstruction from scan, settings, figures of merit and pictures."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ from recon.voxels.matter_checks import UNEXPLAINED_LIMIT, StrayMass, Unexplained
 from recon.voxels.matter_checks import unexplained as unexplained_by
 from recon.voxels.view_weights import Wedge, unseen_wedges
 
-_MATERIAL = 0.3  # share of the 99th percentile from which a voxel is material
-_SHOWN, _UPRIGHT = 12, 8  # times at most; slices from which on upright cuts of them are drawn, too
+_MATERIAL = 0.3  # a voxel is material if its density exceeds this share of the 99th percentile
+# largest number of times that are shown; number of slices from which on vertical sections of them are drawn, too
+_SHOWN, _UPRIGHT = 12, 8
 _NO_REFERENCE = (
     "Neither volume is the ground truth: if only one of them shows a feature, look for it in the projections."
 )
@@ -45,7 +46,7 @@ def compose(
     metrics, judgement = checked.metrics, checked.judgement
     settings = {
         k: as_text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k not in ("command", "recipe")
-    } | {f"law: {name}": left for name, left in prepared.laws.items()}
+    } | {f"law: {name}": left for name, left in prepared.origin.laws.items()}
     return Report(
         title=f"{context.facts.sample or context.facts.name}: {label_of(result.method)}",
         summary=_summary(made, metrics),
@@ -54,7 +55,7 @@ def compose(
         metrics={label_of(method): values for method, values in metrics.items()},
         frames=context.facts.frames,
         flags=[*context.facts.remarks, *context.warnings],
-        done=[each.sentence for each in prepared.done.values() if each.sentence and not each.warned],
+        done=[each.sentence for each in prepared.origin.done.values() if each.sentence and not each.warned],
         pictures=[
             *(_slices(prepared, truth, volumes) if result.series is None else _several(result.series)),
             *_doubts(result, prepared, judgement.unexplained),
@@ -73,13 +74,13 @@ def _summary(made: MadeVolume, metrics: Mapping[str, Mapping[str, float]]) -> st
     name, geometry = label_of(result.method), prepared.geometry
     best = "psnr" if truth is not None else "residual"
     own = metrics[result.method]
-    best = best if best in own else "seconds"  # an FBP region has no figure of quality
+    best = best if best in own else "seconds"  # FBP of a region has no figures of quality
     shape, what = " × ".join(str(n) for n in result.volume.grid.shape), f"{name} volume of"
     if result.series is not None:
         seconds = result.series.seconds
         what = f"{len(seconds)} volumes at successive times, {seconds[0]:.4g} to {seconds[-1]:.4g} s, of"
     summary = (
-        f"{what} {shape} voxels from {geometry.n_views} of {prepared.n_projections} projections in "
+        f"{what} {shape} voxels from {geometry.n_views} of {prepared.origin.n_projections} projections in "
         f"{result.seconds:.1f} s; {METRICS[best].label} {formatted(best, own[best])}"
     )
     if BASELINE in metrics and result.method != BASELINE:
@@ -163,7 +164,7 @@ def _further(
             "Stray mass",
             "Maximum projection of the density in voxels that the projections show to be empty. All of it is an "
             "artefact: less is better.",
-            pictures.stray_mass(stray.map, result.volume.grid, prepared.length_unit, VoxelKind.ATTENUATION),
+            pictures.stray_mass(stray.map, result.volume.grid, prepared.origin.length_unit, VoxelKind.ATTENUATION),
         )
     if facts.references:
         yield Picture(
@@ -183,7 +184,7 @@ def _further(
 
 def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mapping[str, Volume]) -> Iterator[Picture]:
     """Pictures of slices of all volumes, and of their differences from the first volume."""
-    unit, kind = prepared.length_unit, VoxelKind.ATTENUATION
+    unit, kind = prepared.origin.length_unit, VoxelKind.ATTENUATION
     shown = {"Ground truth": truth} if truth is not None else {}
     shown |= {label_of(method): volume for method, volume in volumes.items()}
     yield Picture(
@@ -210,7 +211,7 @@ def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mappin
 
 
 def _several(series: VolumeSeries) -> Iterator[Picture]:
-    """Slices of some of several volumes, side by side."""
+    """Slices of some of the volumes of a time series, side by side."""
     n, depth = series.data.shape[:2]
     some = spread(np.arange(n), _SHOWN)
     for title, turned in (("Slices at each time", False), ("Vertical slices at each time", True)):
@@ -243,13 +244,14 @@ def _displaced(result: Reconstruction, moved: Volume) -> str:
 def _doubts(
     result: Reconstruction, prepared: PreparedProjections, unexplained: Unexplained | None
 ) -> Iterator[Picture]:
-    """Pictures of missing angles, error bars, the residual, and the course of the reconstruction."""
-    unit, kind = prepared.length_unit, VoxelKind.ATTENUATION
+    """Pictures of missing angles, error bars, the residual, and the progress of the reconstruction."""
+    unit, kind = prepared.origin.length_unit, VoxelKind.ATTENUATION
     if unseen := unseen_wedges(prepared.geometry):
         yield Picture("Missing wedge", _of_wedges(unseen), pictures.wedges(result.volume, unseen, unit))
     if result.change is not None:
         moved = Volume(result.volume.data - result.change.data, result.volume.grid)
-        left = unexplained_by(moved, prepared.views.seen, np.random.default_rng(0))
+        check = unexplained_by(moved, prepared.views.seen, np.random.default_rng(0))
+        left = check.alone(moved, prepared.geometry)
         yield Picture(
             "Change since the reference",
             "A slice of the moved reference, of this volume, and of their difference. Red: denser than before, blue: "
@@ -285,8 +287,13 @@ def _doubts(
 
 
 def _views(prepared: PreparedProjections) -> Iterator[Picture]:
-    """Pictures of a corrected projection, a sinogram, the search for the axis, and the poses."""
-    data, geometry, unit, axis = prepared.seen.data, prepared.geometry, prepared.length_unit, prepared.axis
+    """Pictures of a corrected projection, a sinogram, the search for the rotation axis, and the poses."""
+    data, geometry, unit, axis = (
+        prepared.seen.data,
+        prepared.geometry,
+        prepared.origin.length_unit,
+        prepared.origin.axis,
+    )
     yield Picture(
         "Projection",
         f"One corrected projection: the line integral of the {VoxelKind.ATTENUATION.value} along each ray. Air should "

@@ -1,4 +1,4 @@
-"""Runs a method on prepared projections, within its time limit, and computes its error bars."""
+"""Run: runs a method on prepared projections within the time limit, and computes error bars."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def run_on(
     """Run a method on these projections (and the held-out ones if it uses them) until it ends or is stopped.
 
     Args:
-        times: time of the exposure of each projection in s, for a method that makes volumes in time.
+        times: time of the exposure of each projection in s, for a method that makes a volume for each of several times.
 
     Raises:
         ValueError: the method cannot use these projections.
@@ -58,9 +58,8 @@ def run_on(
 
 
 def views_for(method: Method, views: Views) -> Views:
-    """The projections in the form that the method expects, with their weights in memory.
-
-    In data on disk, rays of weight 0 were filled, as a direct method does it. So such a method gets no weights.
+    """The projections in the form that the method expects, with their weights in memory. In data on disk, rays of
+    weight 0 are already filled as a direct method would fill them, so a direct method gets no weights.
     """
     wanted = method.views_wanted(views.seen.geometry)
     if not wanted.all():
@@ -72,7 +71,7 @@ def views_for(method: Method, views: Views) -> Views:
 
 def without_outside(prepared: PreparedProjections, result: Reconstruction) -> PreparedProjections:
     """Subtract the part of the sample outside the volume from the projections, in place, so that the volume and FBP are
-    compared with the rest. Does nothing if nothing is known about the sample outside.
+    compared with the rest. If nothing is known about the sample outside, the projections are not changed.
     """
     if result.outside is None:
         return prepared
@@ -85,11 +84,11 @@ def without_outside(prepared: PreparedProjections, result: Reconstruction) -> Pr
     return replace(prepared, lines=replace(lines, reach=within))
 
 
-_AT_ONCE = 32  # projections that are computed together
-_REPORT = 5.0  # s for the pictures of the report
-_BYTES = 1e8  # bytes of a volume that are written and read back in a second
+_AT_ONCE = 32  # number of projections that are computed together
+_REPORT = 5.0  # time in s for the pictures of the report
+_BYTES = 1e8  # number of bytes of a volume that are written and read back in a second
 _BUSIEST = 4.0  # largest factor by which other programs may slow this down
-_MEASURING = 0.05  # fraction of the time limit for checks of the volume; they are left out if it is reached
+_MEASURING = 0.05  # fraction of the time limit for checks of the volume; checks are left out when they have used it
 
 
 def fit_within(
@@ -101,14 +100,13 @@ def fit_within(
     clock: Clock,
     warn: Warn,
 ) -> tuple[Method, Stop]:
-    """The fit with its time limit (that of the call minus the time for checks, report and writing), and the stop
-    request for the checks.
-
-    If too little time is left, `warn` gets a sentence before the fit.
+    """The fit with its time limit, and the stop request for the checks. The time limit of the fit is that of the call,
+    minus the time already used and the time for checks, report and writing. If no time is left, `warn` gets a sentence
+    before the fit.
 
     Args:
         limit: time limit of the call in s.
-        started: time at which the call started, by the clock, and the CPU time in s used by then.
+        started: time of the clock when the call started, and the CPU time in s that the process had used by then.
     """
     grid, pages = Grid.matching(geometry), target.report is not None
     spent = clock.now() - started[0]
@@ -129,7 +127,7 @@ def fit_within(
 
 @contextmanager
 def warnings_shown(warn: Warn) -> Iterator[None]:
-    """A context in which Python's warnings are forwarded as sentences, without file and line."""
+    """A context manager that forwards Python's warnings as sentences, without file and line."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
         warnings.showwarning = lambda message, *_: warn(str(message))
@@ -140,7 +138,7 @@ DecisionValues = Mapping[str, Sequence[Any]]
 
 
 def refuse_impossible(options: ReconOptions) -> None:
-    """Raise ConfigError before any work if error bars cannot be computed or written."""
+    """Raise ConfigError, before any work, if error bars cannot be computed or written."""
     if not all(method.error_bars for method in options.method.alternatives):
         raise ConfigError(
             f"--uncertainty does not work with {options.method.name}, only with "
@@ -155,7 +153,7 @@ def refuse_impossible(options: ReconOptions) -> None:
 
 
 def refuse_views(method: Method, geometry: Geometry) -> None:
-    """Raise ConfigError before any work if error bars cannot be computed from these projections."""
+    """Raise ConfigError, before any work, if error bars cannot be computed from these projections."""
     if geometry.n_views < LEAST_VIEWS:
         raise ConfigError(
             f"--uncertainty needs at least {LEAST_VIEWS} projections, because it splits them into two halves; there "
@@ -171,13 +169,13 @@ def refuse_views(method: Method, geometry: Geometry) -> None:
 def deviation_of(
     volume: Volume, method: Method, views: Views, options: ReconOptions, decided: DecisionValues, control: RunControl
 ) -> Volume | None:  # fmt: skip
-    """The standard deviation of each voxel of a volume in memory; None if `control` stopped it.
+    """The standard deviation of each voxel of a volume in memory; None if `control` stopped the computation.
 
     Raises:
         ValueError: as `recon.error_bars.error_bars`.
     """
     bars = _bars(method, views, options, volume, decided, control)
-    if control.stop():  # a direct method does not ask
+    if control.stop():  # a direct method does not check for a stop request by itself
         return None
     return None if bars is None else Volume(bars.deviation, volume.grid)
 
@@ -192,10 +190,10 @@ def deviation_by_slabs(
     control: RunControl,
     say: Callable[[str], None],
 ) -> Volume | None:
-    """The standard deviation of each voxel, stored on the output's disk, of a volume on disk; None if `control` stopped
-    it.
+    """The standard deviation of each voxel of a volume on disk, stored on the disk of the output; None if `control`
+    stopped the computation.
 
-    The slab with the most material comes first, and the other slabs use its decisions.
+    The slab with the most material comes first. The other slabs use the decisions that were made for it.
     """
     grid = Grid.matching(prepared.geometry)
     parts = slabs_of(grid.shape[0], slabs[0].own.stop, max(method.halo, HALO))

@@ -1,4 +1,4 @@
-"""Facts about a scan for the report, and the context of a reconstruction."""
+"""Scan facts: facts about a scan for the report, and the context of a reconstruction."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ if TYPE_CHECKING:
     from beamline.report.sheets import FlaggedFrame
 
 MOST = 12
-APART = 3  # frames of a kind that are shown are at least so far apart: neighbours look alike
-PIXELS = 200  # a side of a picture, about
+APART = 3  # shortest distance, in frames, between two shown frames of the same check, because neighbours look similar
+PIXELS = 200  # approximate side of a picture
 
 
 def reasons(flags: FrameFlags) -> list[str]:
-    """One line for each check and level: frames, worst score, meaning; alarms first."""
+    """One line for each check and level, alarms first. A line states the frames, the worst score and the meaning."""
     lines = []
     for level in (Level.ALARM, Level.WARN):
         for i, entry in enumerate(flags.legend):
@@ -75,9 +75,9 @@ def worst_frames(source: ScanSource, flags: FrameFlags, most: int = MOST) -> lis
 
 
 def reference_images(source: ScanSource) -> dict[str, NDArray[np.float32]]:
-    """Mean dark, means of the first and the last group of flats, and the ratio of these two, by title; binned.
-
-    At most four frames of a group are read. Empty for a scan without counts.
+    """Binned pictures by title: the mean dark, the means of the first and the last group of flats, and the ratio of
+    these two means. At most four frames of a group are read. The result is empty if the pixels of the scan are not
+    counts.
     """
     if source.quantity != "counts":
         return {}
@@ -106,7 +106,7 @@ def _ranked(flags: FrameFlags, check: int, entry: FlagBit, level: Level) -> list
 
 
 def _frame(source: ScanSource, flags: FrameFlags, row: int) -> FlaggedFrame:
-    from beamline.report.sheets import FlaggedFrame  # here, as it loads matplotlib
+    from beamline.report.sheets import FlaggedFrame  # imported here, because it loads matplotlib
 
     angle = float(np.degrees(source.table.angles[row]))
     kind, replaces = source.table.kind(row).name.lower(), source.table.replaces
@@ -130,7 +130,9 @@ def _frame(source: ScanSource, flags: FrameFlags, row: int) -> FlaggedFrame:
 
 
 def _small(image: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Pixels binned until there are few; rows and columns that do not fill a bin are dropped."""
+    """The image, binned until it has about `PIXELS` pixels a side. Rows and columns that do not fill a bin are
+    dropped.
+    """
     factor = max(1, min(image.shape[1] // PIXELS, *image.shape))
     return np.asarray(bin_views(np.nan_to_num(image.astype(np.float32))[None], factor)[0])
 
@@ -144,10 +146,12 @@ class ScanFacts:
         frames: number of frames in the file and number of planned frames, e.g. "110/110".
         remarks: faults during the scan, as the file states them.
         flagged: the worst of the flagged frames.
-        references: mean darks and flats [row, col], binned, by title.
-        shape: of a frame.
-        columns: of the detector that are used, the last not included, as --cols takes them; empty: all.
-        ended: how and why the scan ended before it took all its frames; empty: it took all frames, or is still running.
+        references: binned mean darks and flats [row, col], by title.
+        shape: rows and columns of a frame.
+        columns: used columns of the detector, in the form of --cols (the last column is not included); empty: all
+            columns.
+        ended: how and why the scan ended before it took all its frames; empty: the scan took all frames or is still
+            running.
         frames_per_view: number of frames that are averaged to one projection.
         live_picture: file name of the last picture of a live volume; empty: there was no live volume.
     """
@@ -172,7 +176,7 @@ class ReportContext:
     """The context of a reconstruction: the scan, the selection, the command, and the warnings so far.
 
     Attributes:
-        filter: of FBP, also of the one that the volume is compared with.
+        filter: filter of FBP, also of the FBP with which the volume is compared.
         leaves: function that returns True if this number of seconds is left before the report.
     """
 
@@ -191,12 +195,12 @@ class ReportContext:
 
 @dataclass(frozen=True, eq=False)
 class MadeVolume:
-    """A volume, with all that it is judged, recorded and reported by.
+    """A volume, with everything that is needed to check it, to write its record and to make its report.
 
     Attributes:
         result: the volume, and what the method states about it.
-        prepared: the projections that it was made from, and where these come from.
-        truth: the ground truth on the grid of the volume; None: it is not known.
+        prepared: the projections from which the volume was made, and their origin.
+        truth: the ground truth on the grid of the volume; None: there is no ground truth.
         target: the files to write.
         context: the context of the reconstruction.
     """
@@ -214,7 +218,7 @@ def label_of(method: str) -> str:
 
 
 def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
-    """Facts of an open scan; `flags` replace those of the file."""
+    """The facts of an open scan. If `flags` are given, they replace those of the file."""
     attributes = dict(source.attributes)
     sample = str(attributes.pop("sample", attributes.pop("sample_name", "")))
     columns = "" if source.cols is None else f"{source.cols[0]}:{source.cols[1]}"
@@ -239,7 +243,7 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
 
 
 def _table(source: ScanSource, sample: str, columns: str) -> dict[str, str]:
-    """What the reader knows of a scan, by name, for people."""
+    """What the reader knows about a scan, as texts for people, by name."""
     counts = {kind: source.table.of_kind(kind).size for kind in FrameKind}
     pitch, energy = source.pixel_size_mm, source.energy_kev
     return {

@@ -24,18 +24,18 @@ from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.writers.partial_volume import PartialVolume, create_partial, open_partial
 from recon.base.decisions import Decisions
 from recon.base.method import SWEEPS_OF_TRIALS, Ending, Method, Progress, Reconstruction, RunControl
-from recon.base.slabs import Slab, part_of
+from recon.base.slabs import Slab, height_of, part_of
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.voxels.methods import FistaTv
 
-_LOOKED_AT = 8  # views by which the rows with most matter are found
-_WEIGHED = 16  # rows whose weights are made at a time
+_LOOKED_AT = 8  # number of views by which the rows with most material are found
+_WEIGHED = 16  # number of rows whose weights are made together
 
-_LOOK = 0.5  # s between two checks of slabs under way
+_LOOK = 0.5  # s between two checks of the slabs that are being made
 
 T = TypeVar("T")
-RunMethod = Callable[[Method, Views, Grid, RunControl], Reconstruction]  # Reconstructs views on a grid
+RunMethod = Callable[[Method, Views, Grid, RunControl], Reconstruction]  # reconstructs views on a grid
 
 
 @dataclass(frozen=True)
@@ -56,14 +56,14 @@ def in_slabs(
     warn: Warn,
     workers: SlabWorkers | None = None,
 ) -> Reconstruction:
-    """Reconstruct a volume on disk, slab by slab; for a partial volume only the missing slabs.
+    """Reconstruct a volume on disk, slab by slab. For a partial volume, reconstruct only the missing slabs.
 
-    The slab with the most material comes first. The other slabs use its decisions, so that all slabs fit together.
-    Neighbouring slabs overlap and are blended. Each slab depends only on the data and on the first slab, so that a
-    volume that was stopped and resumed is bit-identical.
+    The slab with the most material comes first. The other slabs use the decisions that were made for it, so that all
+    slabs fit together. Neighbouring slabs overlap and are blended. Each slab depends only on the data and on the first
+    slab, so a volume that was stopped and resumed is the same, bit by bit.
 
     Args:
-        control: control of all slabs together; `decide`, if given, gets the decisions that the slabs use.
+        control: control of all slabs together; if it has `decide`, this gets the decisions that the slabs use.
         warn: function that gets a sentence on slices that were reconstructed with another method.
         workers: workers that reconstruct all slabs except the first, several at a time; only this thread writes.
 
@@ -95,7 +95,7 @@ def in_slabs(
 
 @dataclass(frozen=True, eq=False)
 class _SlabJob:
-    """The slabs of one volume; arguments as of `in_slabs`."""
+    """The slabs of one volume. For the arguments see `in_slabs`."""
 
     run: RunMethod
     prepared: PreparedProjections
@@ -122,8 +122,9 @@ class _SlabJob:
             listen(Progress(done, slices, seconds, nan, nan, 0, views, unit="slices"))
 
     def resumed(self) -> PartialVolume | None:
-        """The partial volume to complete; None: a new one is needed. DataError if it belongs to another
-        reconstruction."""
+        """The partial volume to complete; None: a new one is needed. Raises DataError if it belongs to another
+        reconstruction.
+        """
         if (path := self.options.partial) is None:
             return None
         partial = open_partial(path)
@@ -154,11 +155,12 @@ class _SlabJob:
     def made(
         self, n: int, by: RunMethod, decide: Decisions, done: int, *, first: bool
     ) -> tuple[Reconstruction | None, str]:
-        """The slab, and a sentence on it; None if all projections are zero.
+        """The slab (None if all projections are zero), and a remark: a sentence if another method was used, otherwise
+        "".
 
         Args:
             done: number of slices that are finished before this slab.
-            first: the first of all slabs, whose decisions the other slabs use.
+            first: True for the first of all slabs, whose decisions the other slabs use.
         """
         slab, slices, method = self.slabs[n], self.grid.shape[0], self.options.method
         listen = _of_all(self.control, self.begin, done, slab, slices)
@@ -170,9 +172,11 @@ class _SlabJob:
         in_all = sum(each.slices.stop - each.slices.start for each in self.slabs)
         try:
             height = slab.slices.stop - slab.slices.start
-            return by(method.for_part(height / slices, height / in_all), part, box, control), ""
+            method = method.for_part(height / slices, height / in_all)
+            return by(method.at_height(height_of(rows, self.prepared.geometry)), part, box, control), ""
         except DataError as error:
-            # A fit needs matter to place Gaussians in; a slab of air has none, and voxels need none.
+            # A fit needs material in which to place Gaussians; a slab of air has none. A voxel method does not need
+            # material.
             if first or not method.needs_matter:
                 raise
             remark = f"Slices {slab.own.start} to {slab.own.stop - 1} were reconstructed with fista-tv instead: {error}"
@@ -180,18 +184,20 @@ class _SlabJob:
 
 
 def _as_they_come(make: Callable[[int], T], numbers: Sequence[int], at_a_time: int) -> Iterator[tuple[int, T]]:
-    """Yield each slab with the result of `make`; at most `at_a_time` are being made or wait to be taken."""
+    """Yield the number of each slab with the result of `make`. At most `at_a_time` slabs are being made, or wait until
+    the caller takes them.
+    """
     pool, ahead, under_way = ThreadPoolExecutor(at_a_time), list(numbers), dict[Future[T], int]()
     try:
         while ahead or under_way:
             while ahead and len(under_way) < at_a_time:
                 n = ahead.pop(0)
                 under_way[pool.submit(make, n)] = n
-            # On Windows a wait without an end is deaf to Ctrl-C.
+            # On Windows, Ctrl-C does not interrupt a wait without a time limit.
             for task in wait(under_way, _LOOK, FIRST_COMPLETED).done:
                 yield under_way.pop(task), task.result()
     finally:
-        # A thread that has returned its slab holds the partial volume, and its lock, until it ends.
+        # A thread that has returned its slab keeps the partial volume, and the lock on it, until the thread ends.
         pool.shutdown(wait=not under_way, cancel_futures=True)
 
 
@@ -203,10 +209,10 @@ def _add(partial: PartialVolume, n: int, result: Reconstruction | None, remark: 
 
 @contextmanager
 def keeping(path: Path) -> Iterator[None]:
-    """A context that removes the partial volume at `path` on success, and keeps it otherwise.
+    """A context manager that removes the partial volume at `path` on success, and keeps it otherwise.
 
     Raises:
-        ScanStopped: instead of KeyboardInterrupt, if there are finished slabs from which to continue.
+        ScanStopped: replaces KeyboardInterrupt if there are finished slabs, from which a later call can continue.
     """
     try:
         yield
@@ -221,7 +227,7 @@ def keeping(path: Path) -> Iterator[None]:
 
 
 def _provenance(prepared: PreparedProjections, options: ReconOptions) -> dict[str, Value]:
-    """All that determines the slabs."""
+    """The origin of the slabs (see `origin_of`): everything that determines them."""
     weights = hashlib.sha256()
     if options.method.weighs:
         rows = prepared.geometry.detector_shape[0]
@@ -241,7 +247,7 @@ def _record(prepared: PreparedProjections, options: ReconOptions, grid: Grid, no
     path = Path(options.source.path)
     return ReconRecord(
         volume=prepared.stretched(Volume(np.broadcast_to(np.float32(0), grid.shape), grid)),
-        length_unit=prepared.length_unit,
+        length_unit=prepared.origin.length_unit,
         raw_file=str(path.resolve()),
         title=f"Partial reconstruction of {path.name}",
         sample="not stated",
@@ -262,7 +268,7 @@ def _kept(first: Reconstruction, decide: Decisions) -> dict[str, Any]:
 
 
 def _finished(partial: PartialVolume, grid: Grid, options: ReconOptions, seconds: float) -> Reconstruction:
-    """The result, when all slabs are there."""
+    """The result, after all slabs are finished."""
     kept = partial.kept
     settings = {**kept["settings"], "slabs": len(partial.slabs), "slab_halo": options.method.halo}
     history = tuple(Progress(*values) for values in kept["history"])
@@ -273,7 +279,7 @@ def _finished(partial: PartialVolume, grid: Grid, options: ReconOptions, seconds
 
 
 def busiest_first(prepared: PreparedProjections, grid: Grid, slabs: Sequence[Slab]) -> list[int]:
-    """Numbers of the slabs, beginning with the slab whose rows show the most material."""
+    """The numbers of the slabs. The first number is that of the slab whose rows show the most material."""
     data = prepared.seen.data
     some, rows = data[:: max(1, len(data) // _LOOKED_AT)], [part_of(prepared.geometry, grid, s.own)[0] for s in slabs]
     absorption = [sum(float(np.abs(view[part]).sum(dtype=np.float64)) for view in some) for part in rows]
@@ -282,7 +288,7 @@ def busiest_first(prepared: PreparedProjections, grid: Grid, slabs: Sequence[Sla
 
 
 def _of_all(control: RunControl, begin: float, done: int, slab: Slab, slices: int) -> Callable[[Progress], None] | None:
-    """A listener to one slab that reports the progress of all slices; `done` slices come before it."""
+    """A listener to one slab that reports the progress of all slices. `done` slices were finished before this slab."""
     listen = control.on_progress
     if listen is None:
         return None
@@ -295,7 +301,7 @@ def _of_all(control: RunControl, begin: float, done: int, slab: Slab, slices: in
             0.0 if progress.unit.startswith(SWEEPS_OF_TRIALS) or not progress.steps else progress.step / progress.steps
         )
         at = done + round((slab.own.stop - slab.own.start) * share)
-        reached = max(reached, at)  # a fit's finish counts from the beginning
+        reached = max(reached, at)  # the voxel refinement after a fit counts from its own beginning
         listen(replace(progress, step=reached, steps=slices, seconds=control.now() - begin, unit="slices"))
 
     return watch

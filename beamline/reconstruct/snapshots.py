@@ -1,4 +1,6 @@
-"""Snapshots of the live volume and slices of its projections: a file and a picture, each replaced in one step."""
+"""Snapshots: the file of the live volume, and the picture of the volume and of FBP slices; each is replaced in one
+step.
+"""
 
 from __future__ import annotations
 
@@ -48,12 +50,12 @@ class Snapshots:
         self.drawn = False  # True if the picture is of this scan
         self._slices: tuple[PictureRow, ...] = ()  # last drawn rows of the picture: FBP slices, and the volume
         self._grown: tuple[PictureRow, ...] = ()
-        self._at: Sequence[float] | None = None  # z, y and x of the FBP slices
+        self._at: Sequence[float] | None = None  # z, y and x of the FBP slices, at which the volume is also shown
         self._unseen: Wedge | None = None  # missing wedge of the projections of these slices
         self.unit = "mm" if source.pixel_size_mm or options.selection.pixel_size_mm else "px"
 
     def write(self, fit: StreamingFit, axis_col: float) -> None:
-        """Write the current volume and its picture, replacing the last ones."""
+        """Write the current volume and its picture, which replace the last ones."""
         shown = fit.best_preview()
         (method, errors), unseen = self._method(shown), self._unseen
         record = ReconRecord(
@@ -93,8 +95,9 @@ class Snapshots:
         unseen: Wedge | None,
         below: PictureRow | None = None,
     ) -> None:
-        """Write the picture: these FBP slices, and below them another row, or the last drawn slices of the volume if
-        there are any."""
+        """Write the picture: these FBP slices, and below them the rows `below`, or the last drawn slices of the volume
+        if there are any.
+        """
         self._at, self._unseen = slices.at, unseen
         panels = slice_panels(slices.images, slices.at, slices.pixel, self.unit, unseen)
         self._slices = (PictureRow(heading, panels), *([] if below is None else [below]))
@@ -111,7 +114,9 @@ class Snapshots:
             self.path.unlink(missing_ok=True)
 
     def _method(self, shown: BetterVolume) -> tuple[str, dict[str, float]]:
-        """Method of the volume that is shown, and the errors of both methods in held-out projections if compared."""
+        """The method of the volume that is shown. If two methods were compared, also their errors in held-out
+        projections.
+        """
         fit, found = self._options.streaming.name, shown.errors
         errors = {fit: found.fit, Fbp.name: found.direct} if math.isfinite(found.direct) else {}
         return Fbp.name if shown.direct else fit, errors
@@ -136,14 +141,16 @@ def _why(errors: Mapping[str, float]) -> str:
     return f"because it matches the held-out projections better (errors: {each})"
 
 
-FEWEST, _BEFORE_AXIS = 8, 32  # projections needed for the first slices; projections used before the axis is known
+# fewest projections for the first slices; number of projections used before the axis is known
+FEWEST, _BEFORE_AXIS = 8, 32
 
 
 class LiveSlices:
-    """Draws slices when there are new projections and enough time has passed; uses at most half of the time.
+    """Draws slices when there are new projections and enough time has passed. Drawing uses at most half of the time.
 
     Args:
-        below: gives a further row of the picture from the projections; None: there is none.
+        below: function that makes a further row of the picture from the projections; it returns None if there is no
+            such row.
     """
 
     def __init__(
@@ -151,16 +158,17 @@ class LiveSlices:
         below: Callable[[Sequence[F32], Geometry], PictureRow | None] = lambda views, geometry: None,
     ) -> None:  # fmt: skip
         self._views, self._snapshots, self._clock, self._below = views, snapshots, clock, below
-        self._newest, self._next = -1, -math.inf  # the last view drawn; the time from which they are drawn again
+        # the last view that was drawn; the time from which slices may be drawn again
+        self._newest, self._next = -1, -math.inf
 
     def draw(self, parts: Sequence[Projections], axis_col: float | None, pause: float | None, of: int = 0) -> None:
-        """Draw slices of corrected projections around the axis (a column of the file; None: the detector middle).
-
-        There are no slices for a cone beam, or if the projections have a roll, a tilt or shifts.
+        """Draw slices from corrected projections. `axis_col` is the rotation axis as a column of the file; None: the
+        middle of the detector is used as axis. No slices are drawn for a cone beam, or if the projections have a roll,
+        a tilt or shifts.
 
         Args:
-            pause: least time in s until slices are drawn again; None: draw now.
-            of: number of projections so far; 0 if `parts` has all of them.
+            pause: shortest time in s until slices are drawn again; None: draw now.
+            of: number of projections so far; 0 if `parts` contains all of them.
         """
         n, begin = sum(part.view_ids.size for part in parts), self._clock.now()
         if n < FEWEST or (pause is not None and begin < self._next) or int(parts[-1].view_ids[-1]) == self._newest:
@@ -186,13 +194,13 @@ class LiveSlices:
         self._newest, self._next = int(ids[-1]), end + max(pause or 0.0, end - begin)
 
     def due(self, views: NDArray[np.int64], pause: float | None) -> bool:
-        """Whether `draw` would draw these projections (rows of the file) now; `pause` as there."""
+        """Whether `draw` would draw these projections (rows of the file) now. For `pause` see `draw`."""
         early = pause is not None and self._clock.now() < self._next
         return views.size >= FEWEST and not early and int(views[-1]) != self._newest
 
     def draw_about_middle(self, lines_of: Callable[[NDArray[np.int64]], Projections], pause: float | None) -> None:
-        """Draw slices before the axis is known, from some projections (rows of the file) that `lines_of` corrects only
-        for this.
+        """Draw slices before the axis is known. They are made from some projections that `lines_of` corrects for this
+        purpose only; its argument is their rows of the file.
         """
         views = self._views.chosen(self._views.usable().frames)
         if not self.due(views, pause):
@@ -202,7 +210,7 @@ class LiveSlices:
 
 
 def _coverage(unseen: Wedge | None, angles: NDArray[np.float64]) -> str:
-    """The addition to a heading if the projections do not cover all angles."""
+    """The words that are added to a heading if the projections do not cover all angles."""
     if unseen is None:
         return ""
     order = "sequential: " if one_way(angles) else ""

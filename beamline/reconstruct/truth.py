@@ -1,4 +1,4 @@
-"""Ground truth: the true volume on the grid of a reconstruction, and the comparison of volume files with it."""
+"""Ground truth: puts the true volume on the grid of a reconstruction, and compares volume files with it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def read_truth(spec: str) -> NDArray[np.float32]:
 
     Raises:
         ConfigError: no such file, or slices outside it.
-        DataError: the file holds no volume.
+        DataError: the file does not contain a volume.
     """
     match = re.fullmatch(r"(?P<path>.+?)(:(?P<first>\d*):(?P<end>\d*))?", spec)
     if match is None or not Path(match["path"]).exists():
@@ -44,7 +44,9 @@ def read_truth(spec: str) -> NDArray[np.float32]:
 
 
 def _volume_in(path: Path) -> str | None:
-    """Where an HDF5 file has its volume; None for other files. Raises DataError: no volume at a known place."""
+    """The path of the volume in an HDF5 file; None for other files. Raises DataError if there is no volume at a known
+    path.
+    """
     if not (path.is_file() and h5py.is_hdf5(path)):
         return None
     with hdf5.open_hdf5(path) as file:
@@ -55,7 +57,7 @@ def _volume_in(path: Path) -> str | None:
 
 
 def fit_truth(truth: NDArray[np.float32], grid: Grid, binning: int) -> Volume:
-    """The reference volume on `grid`; a reference that is `binning` times finer is averaged.
+    """The reference volume on `grid`. If the voxels of the reference are `binning` times finer, they are averaged.
 
     Raises:
         ConfigError: the shapes do not fit.
@@ -78,10 +80,10 @@ def fit_truth(truth: NDArray[np.float32], grid: Grid, binning: int) -> Volume:
 
 
 def measured_file(path: Path, truth: str | None, masks: Path | None) -> dict[str, float]:
-    """Figures of merit of a volume file: against a reference volume, and in regions drawn by the user.
+    """Figures of merit of a volume file, compared with a reference volume and in regions that the user has drawn.
 
     Args:
-        truth: as for `read_truth`.
+        truth: the reference volume, see `read_truth`.
         masks: labels [z, y, x] of the volume's shape: 1 dense, 2 empty, 0 not used.
 
     Raises:

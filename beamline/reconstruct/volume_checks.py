@@ -26,9 +26,9 @@ from recon.voxels.matter_checks import STRAY_LIMIT, UNEXPLAINED_LIMIT, lost_matt
 from recon.voxels.odd_views import LIMIT, OddView
 from recon.voxels.view_weights import density_gain
 
-_NAMED = 5  # most odd projections that the warning names
-_COMPARED = ("fbp", "fista-tv")  # methods that show cracks well: fbp sharp edges, fista-tv low noise
-_FBP_WORK = 2.5  # time of FBP, in units of the time of one forward projection of all views
+_NAMED = 5  # largest number of odd projections that the warning names
+_COMPARED = ("fbp", "fista-tv")  # methods that show cracks well: FBP has sharp edges, FISTA-TV has low noise
+_FBP_WORK = 2.5  # time of FBP, in units of the time to project the volume once into all views
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +37,12 @@ class CheckedVolume:
 
     Attributes:
         judgement: comparison of the volume with its projections and with the ground truth.
-        volumes: the volume by method; before it FBP of the same projections, if the volume is compared with FBP.
+        volumes: volumes by method: FBP of the same projections, if the volume is compared with FBP, and then the volume
+            itself.
         metrics: figures of merit of each volume, by method.
         warnings: all warnings, those of the context first.
         hiding_warning: the warning that the volume may hide structure; empty if there is none.
-        skipped_text: a sentence about the checks that were left out, with the reason; empty if none was.
+        skipped_text: a sentence about the checks that were left out, with the reason; empty if no check was left out.
     """
 
     judgement: Judgement
@@ -55,8 +56,8 @@ class CheckedVolume:
 def check_volume(made: MadeVolume, sink: Sink, clock: Clock) -> CheckedVolume:
     """Compare a volume with its projections and with FBP, and send each warning to `sink`.
 
-    Checks are left out, with a remark, if they would take longer than the time limit in `context` allows, or if the
-    reconstruction was stopped.
+    Checks are left out if they would take longer than the time limit in `context` allows, or if the reconstruction was
+    stopped. The result then has a remark.
     """
     result, prepared, truth, context = made.result, made.prepared, made.truth, made.context
     volumes, warnings = {result.method: result.volume}, list(context.warnings)
@@ -104,9 +105,8 @@ def check_volume(made: MadeVolume, sink: Sink, clock: Clock) -> CheckedVolume:
 
 
 def _aspects(made: MadeVolume) -> Aspect:
-    """The checks that this volume allows. No residual is computed if the projections show more than the volume.
-
-    They show more if the volume is only a region, or if the sample is larger than the field of view and the part
+    """The checks that can be made for this volume. No residual is computed if the projections show more than the
+    volume. This is so if the volume is only a region, or if the sample is larger than the field of view and the part
     outside was not subtracted. The residual of a direct method contains the blur of its filter.
     """
     result, prepared = made.result, made.prepared
@@ -128,7 +128,7 @@ def _sample_radius(result: Reconstruction, prepared: PreparedProjections) -> str
     if SAMPLE not in result.settings:
         return ""
     radius, low, high, density = (result.settings[name] for name in SampleRadius(1, 1, 1, 1).settings)
-    unit, reach = prepared.length_unit, prepared.geometry.reach
+    unit, reach = prepared.origin.length_unit, prepared.geometry.reach
     known, sure = "as given", ""
     if density == 1:
         known = "assumed, because there are too few projections to measure it"
@@ -199,7 +199,9 @@ def _needles(result: Reconstruction, prepared: PreparedProjections) -> str:
 
 
 def odd_views_warning(odd: Sequence[OddView], made: MadeVolume) -> str:
-    """The warning about projections that do not fit the volume, with frames and pixels of the worst; empty if none."""
+    """The warning about projections that do not fit the volume, with frames and pixels of the worst ones; empty if all
+    projections fit.
+    """
     if not odd:
         return ""
     frames, selection = made.prepared.ids, made.context.selection
@@ -234,10 +236,10 @@ def _fbp(made: MadeVolume) -> Volume:
 def _beside_each_other(
     result: Reconstruction, volumes: Mapping[str, Volume], judgement: Judgement, truth: Volume | None, seed: int
 ) -> dict[str, dict[str, float]]:
-    """Figures of merit that compare volumes: SNR and CNR in regions of one reference, and the air level.
-
-    The reference is the ground truth, otherwise FBP of the projections; without both, SNR and CNR are not computed. The
-    air level is in units of the FBP noise in air, and is given if the projections show air.
+    """Figures of merit that compare volumes: SNR and CNR in regions of one reference, and the air level. The reference
+    is the ground truth if there is one, otherwise FBP of the projections, otherwise the volume of a direct method.
+    Without a reference, SNR and CNR are not computed. The air level is in units of the noise of FBP in air. It is
+    computed if the projections show air.
     """
     direct_one = None if by_name(result.method).fitted else result.volume
     reference = truth or volumes.get(BASELINE) or direct_one
@@ -246,14 +248,14 @@ def _beside_each_other(
         figures |= contrast(reference, volumes, seed)
     if (stray := judgement.stray) is not None and BASELINE in volumes:
         _, noise = stray.level(volumes[BASELINE])
-        for name, each in volumes.items() if noise > 0 else ():  # which excludes NaN
+        for name, each in volumes.items() if noise > 0 else ():  # NaN is excluded by this comparison
             figures[name]["air"] = stray.level(each)[0] / noise
     return figures
 
 
 def _lost_material(result: Reconstruction, prepared: PreparedProjections, fbp: Volume) -> str:
     """The warning that weakly absorbing material is missing in the volume, although FBP shows it."""
-    lit, seen = prepared.measured, None  # seen [z]: the detector row of the slice was in the beam
+    lit, seen = prepared.sources.measured, None  # seen [z]: the detector row of the slice was in the beam
     if lit is not None and prepared.geometry.rows_show_slices and fbp.grid.shape[0] == len(lit):
         seen = np.asarray(lit.any(axis=1))
     if (lost := lost_matter(result.volume.data, fbp.data, seen)) is None:

@@ -119,7 +119,8 @@ def slice_panels(
 
 
 def reference_row(shown: Preview, n_views: int, unit: str) -> PictureRow:
-    """The middle slice of a moved reference, of this with FBP of what it leaves of the projections, and of the latter.
+    """Middle slices of three volumes: the moved reference, the FBP volume of the residual that the reference leaves in
+    the projections, and the sum of both.
 
     Args:
         n_views: number of projections so far.

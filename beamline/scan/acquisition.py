@@ -264,8 +264,8 @@ class Acquisition:
             return
         self._sink(StateEntered(self._supervision.states.state, f"Warming up the scintillator for {seconds:g} s"))
         deadline = self._clock.now() + seconds
-        while (left := deadline - self._clock.now()) > 0 and not self._stop.stopping:
-            self._clock.sleep(min(SLICE, left))
+        while (remaining := deadline - self._clock.now()) > 0 and not self._stop.stopping:
+            self._clock.sleep(min(SLICE, remaining))
 
     def wait_while_paused(self, reopen: bool = True) -> None:
         """Wait with closed shutter as long as a pause is requested. A stop ends the wait.

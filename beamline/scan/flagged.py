@@ -37,7 +37,7 @@ class FlaggedFrames:
         self._sink, self._react, self._retaken_warnings = sink, react, retaken_warnings
         self._flags: list[Flag] = []
         self._active: set[tuple[str, Level]] = set()
-        self._triggers: dict[int, int] = {}  # of the projections, by row
+        self._triggers: dict[int, int] = {}  # triggers of the projections, by row
         self._replaced: set[int] = set()
         self.retaken = 0
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from beamline.core.text import count, size
 from beamline.plan.plan import Mode, ScanPlan, one_way
 
-# Bytes for line integrals, fit and voxel refinement, measured with 128 x 256 pixels and 300 projections.
+# Measured bytes per value for line integrals, fit and voxel refinement, with 128 x 256 pixels and 300 projections.
 _A_RAY, _A_VOXEL = 40, 50
-_WIDEST = 512  # columns: no processor can reconstruct a wider volume as fast as projections arrive
-_FEWEST = 90  # projections
-_SHARE = 0.5  # share of the free memory
-_PASSES = range(8, 1, -1)  # numbers of passes of an interlaced scan, the best first
+_WIDEST = 512  # largest number of columns: no processor can reconstruct a wider volume as fast as projections arrive
+_FEWEST = 90  # smallest number of projections
+_SHARE = 0.5  # share of the free memory that is used
+_PASSES = range(8, 1, -1)  # possible numbers of passes of an interlaced scan, the best first
 _SEQUENTIAL, _INTERLACED, _GOLDEN = "15.0, 19.6, 22.7", "22.0, 25.6, 27.6", "22.9, 26.0, 28.1"
 """PSNR in dB of the live volume after a quarter, half and three quarters of a scan of particles with 90 projections."""
 
@@ -23,8 +23,8 @@ class LivePlan:
     """The part of a scan that its live volume uses."""
 
     binning: int = 1  # binning of rows and columns
-    every: int = 1  # one projection in N is used, in the order taken
-    bytes: int = 0  # of memory, about
+    every: int = 1  # one projection in N is used, in the order of acquisition
+    bytes: int = 0  # approximate memory in bytes
 
     @property
     def whole(self) -> bool:
@@ -83,7 +83,7 @@ def live_bytes(shape: tuple[int, int], n_views: int, binning: int = 1) -> int:
 
 
 def live_need(shape: tuple[int, int], n_views: int, free: int) -> str:
-    """A sentence on the live volume: its projections and pixels, its memory, and the reason for its size."""
+    """A sentence about the live volume: its projections and pixels, its memory, and the reason for its size."""
     plan = live_plan(shape, n_views, free)
     rows, cols = (max(1, n // plan.binning) for n in shape)
     views, most = math.ceil(n_views / plan.every), f"half of the {size(free)} of free memory"

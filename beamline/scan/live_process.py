@@ -16,7 +16,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TextIO
 
-from beamline.config.load import Config, plan_of
+from beamline.config.load import Config
+from beamline.config.planned import plan_of
 from beamline.core.event_lines import event_of
 from beamline.core.events import Done, Failed, Sink, StateEntered, Warned
 from beamline.core.machine import free_memory
@@ -74,7 +75,8 @@ class Commands:
     reconstruction.
 
     Attributes:
-        live: while the scan runs; it makes the volume, unless it only `draws` pictures and ends with the scan.
+        live: command that runs during the scan. It makes the volume, unless it only `draws` pictures and ends with the
+            scan.
         remark: a remark for the operator; "" if there is none.
     """
 
@@ -188,7 +190,7 @@ class LiveReconstruction:
         self._sink, self._log, self._on_law, self._what = sink, log, on_law, what
         self._silence, self.ended = silence, False
         self._done: Mapping[str, Any] | None = None
-        self._wanted = True  # nobody has asked it to end
+        self._wanted = True  # no other code has asked it to end
         self._ready, self._shown = threading.Event(), threading.Event()
         self._process: ChildProcess | None = None
         self._command, self._low_priority, self._again, self._child = command, low_priority, _AGAIN, child
@@ -254,7 +256,7 @@ class LiveReconstruction:
         return self._done
 
     def end_shown(self, stop: Callable[[], bool]) -> None:
-        """Kill it when its picture shows all projections, or after 5 s; `stop` ends the wait."""
+        """Kill the process when its picture shows all projections, or after 5 s. `stop` ends the wait."""
         with self._changing:
             process, self._wanted = self._process, False
         deadline = time.monotonic() + _SHOWN_WITHIN
@@ -354,7 +356,7 @@ class Standby:
 
 
 def reconstruct(command: Sequence[str], log: Path, sink: Sink, stop: StopRequest) -> Mapping[str, Any] | None:
-    """Reconstruct a complete scan in a separate process, and return the data of its event `done`; None if it failed."""
+    """Reconstruct a complete scan in a separate process. Return the values of the event `done`; None if it failed."""
     process = LiveReconstruction(command, log, sink, what="reconstruction", silence=math.inf, low_priority=False)
     try:
         return process.finish(lambda: stop.stopping, lambda: stop.aborting)

@@ -73,12 +73,13 @@ class Measurement:
 
     Attributes:
         began: time at which the run began, on the monotonic clock.
-        series: the run that is continued, if any.
-        source_of: makes the object that delivers the frames if another program controls the scan; None: this program
-            does, with the devices.
-        child: starts the live reconstruction.
-        turn: returns when the scan may begin; `poll` waits a moment, and returns whether Enter was pressed.
-        first_state: the scan with the darks and flats of this scan; None: it takes its own.
+        series: the run that is continued; None: a new run.
+        source_of: function that makes the object that delivers the frames, if another program controls the scan. None:
+            this program controls the scan with its devices.
+        child: function that starts the live reconstruction.
+        turn: function that returns when the scan may begin. Its argument `poll` is a function that waits a moment and
+            returns whether Enter was pressed.
+        first_state: the scan whose darks and flats are copied; None: this scan takes its own.
     """
 
     config: Config
@@ -135,8 +136,8 @@ class Measurement:
 
         Args:
             command: the command of the live reconstruction.
-            release: called when the instrument is free for another scan.
-            draws: the live reconstruction only draws pictures, and ends with the scan.
+            release: function that is called when the instrument is free for another scan.
+            draws: True if the live reconstruction only draws pictures and ends with the scan.
         """
         storage, shape = self.config.storage, self.ready.timing.shape
         if sentence := prepare_memory(self.instrument.frame_memory, self.ready.timeline, shape):

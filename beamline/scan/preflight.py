@@ -1,332 +1,30 @@
-"""Preflight: checks a scan before anything moves, without devices (dry run) or with connected devices."""
+"""Preflight: checks a scan with connected devices before anything moves. `dry_run` plans it without devices."""
 
 from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from beamline.config.beam import NoBeamMonitor
-from beamline.config.load import Config, camera_settings, each_scan, plan_of, quantities, resolved_yaml
+from beamline.config.load import Config, resolved_yaml
 from beamline.config.monitor import configured_checks
-from beamline.core.errors import ConfigError
+from beamline.config.planned import camera_settings, plan_of
 from beamline.core.events import json_of
-from beamline.core.files import broken_link
-from beamline.core.machine import free_memory
-from beamline.core.quantities import doubt, doubt_span
-from beamline.core.text import count, size
-from beamline.instrument import connect
 from beamline.instrument.connect import ConnectedDevices
 from beamline.monitor.check import ScanContext
 from beamline.monitor.digest import digests
 from beamline.monitor.watch import Monitor, usual_step
 from beamline.monitor.watch import start as start_monitor
-from beamline.plan.limits import ROOM
-from beamline.plan.needs import OperatorRequest, ScanNeeds, all_needs
 from beamline.plan.plan import Mode, ScanPlan, Timeline
-from beamline.plan.timeline import describe as describe_timeline
-from beamline.plan.timeline import hms_text, work_out
-from beamline.scan.live_plan import better_order, live_need
+from beamline.scan.dry_run import Remaining, all_of, disk_of, lockable, refuse_violations, worked_with
 from beamline.storage.writer_lock import no_locks
 from beamline.storage.writers.nxtomo import ScanInfo
-from drivers.base.frame import FrameKind
-from drivers.base.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource
-from drivers.orca_quest import PITCH_MM
-from recon.methods import streams
-
-# Function that removes from a plan the frames that earlier files of the same scan contain
-Remaining = Callable[[ScanPlan], ScanPlan]
-
-
-def all_of(plan: ScanPlan) -> ScanPlan:
-    """Returns the whole plan unchanged."""
-    return plan
-
-
-class EnergyNeeds(NamedTuple):
-    """Time (s) and disk space (bytes) of the scan at one energy (keV)."""
-
-    kev: float
-    duration: float
-    total_bytes: int
-
-
-class StateNeeds(NamedTuple):
-    """Time (s) and disk space (bytes) of the scan of one state, by its number."""
-
-    state: int
-    duration: float
-    total_bytes: int
-
-
-@dataclass(frozen=True, eq=False)
-class DryRun:
-    """A scan that was planned without devices: plan, timeline, limits of stage and camera, and free bytes on the disk.
-
-    For a series it is the first scan; `energies` or `states` lists the needs of each scan.
-
-    Attributes:
-        disk: an existing folder on the disk of the file.
-        needs: of all scans, with the time between states.
-        every: s from the begin of one state to the next; None: another program says when.
-    """
-
-    plan: ScanPlan
-    timeline: Timeline
-    stage: StageLimits
-    camera: CameraTiming
-    free_bytes: int
-    needs: ScanNeeds
-    disk: Path
-    energies: tuple[EnergyNeeds, ...] = ()
-    states: tuple[StateNeeds, ...] = ()
-    every: float | None = None
-
-    def lines(self) -> list[str]:
-        """The plan as lines of text. Violations are not included; `refuse_violations` reports them."""
-        lines = describe_timeline(self.plan, self.timeline, self.stage, self.camera, free_bytes=self.free_bytes)
-        each, needs = self.energies, self.needs
-        if each:
-            sentence = (
-                f"{len(each)}, {each[0].kev:.7g} to {each[-1].kev:.7g} keV, one scan like this at each energy: "
-                f"{hms_text(needs.duration)} and {size(needs.total_bytes)} in total (without the moves of the "
-                "monochromator)"
-            )
-            lines.append(f"{'energies':<10}{sentence}")
-        if self.states:
-            lines.append(f"{'states':<10}{self._states_in_words()}")
-        if needs.dose_gy is not None:
-            lines.append(f"{'dose':<10}{needs.dose_gy:.4g} Gy")
-        return [*lines, *(f"{'operator':<10}{what}, {count(times, 'time')}" for what, times in needs.operator)]
-
-    def _states_in_words(self) -> str:
-        longest, every = max(one.duration for one in self.states), self.every
-        when = "each when `beamline resume` is sent" if every is None else f"one every {hms_text(every)}"
-        late = every is not None and longest > every
-        more = f"; a state takes {hms_text(longest)}, so the next one begins later than planned" if late else ""
-        return (
-            f"{len(self.states)}, one scan like this of each, {when}: {hms_text(self.needs.duration)} and "
-            f"{size(self.needs.total_bytes)} in total{more}"
-        )
-
-    def data(self) -> Mapping[str, Any]:
-        """The numbers in these lines, for programs, in s, rad, bytes and pixels."""
-        worked, views = self.timeline, self.timeline.views
-        return {
-            **self.needs.data(),
-            "remarks": worked.remarks,
-            "duration": worked.duration,
-            "n_frames": worked.n_frames,
-            "total_bytes": worked.total_bytes,
-            "free_bytes": self.free_bytes,
-            "step_counts": worked.step_counts,
-            "step": worked.step,
-            "speed": views.speed,
-            "taxi": views.taxi,
-            "blur_px": worked.blur_px,
-            "skew_px": worked.skew_px,
-            "min_period": self.camera.min_period,
-            "energies": [need._asdict() for need in self.energies],
-            "states": [need._asdict() for need in self.states],
-            "blocks": [
-                {"kind": b.kind.name.lower(), "mode": b.mode, "first_row": row, "n": b.n_to_take}
-                for b, row in zip(worked.blocks, worked.first_rows, strict=True)
-            ],
-        }
-
-
-def doubts(config: Config) -> list[str]:
-    """Warnings about implausible values, for example because of a wrong unit; empty if all values are plausible."""
-    theta = np.degrees(plan_of(config).angles)
-    ends = float(np.ptp(theta))
-    spans = getattr(config.scan.angles, "span_deg", ends), ends, ends * theta.size / max(theta.size - 1, 1)
-    sentences = [
-        *(doubt(".".join(at), value) for at, value in quantities(config.model_dump(exclude={"simulation"}))),
-        next(filter(None, map(doubt_span, spans)), ""),
-        _doubt_optics(config),
-    ]
-    return [sentence for sentence in dict.fromkeys(sentences) if sentence]
-
-
-_DEMAGNIFIED = 100  # ratio of the pixel size at the sample to that of the camera; no optics demagnifies more
-
-
-def _doubt_optics(config: Config) -> str:
-    """A sentence if pixel size and distance do not match the camera, for example because of a wrong unit; otherwise
-    empty.
-    """
-    optics, camera, own = config.optics, config.devices.camera, 1e3 * PITCH_MM
-    settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
-    # mm; half the width of the field of view
-    half = 5e-4 * optics.pixel_size_um * camera.binning * camera.timing_of(settings).shape[1]
-    if optics.pixel_size_um > _DEMAGNIFIED * own:
-        return (
-            f"optics.pixel_size_um is {optics.pixel_size_um:g} um, but the camera's pixels are {own:g} "
-            f"um: the field of view would be {2 * half:.4g} mm wide. The setting is the size of an "
-            "unbinned pixel at the sample; is it in nm?"
-        )
-    return (
-        f"optics.distance_mm is {optics.distance_mm:g} mm from sample to detector, less than half the "
-        f"field of view of {2 * half:.4g} mm: a sample that fills the field could not rotate there. Is it "
-        "in m?"
-        if optics.distance_mm and optics.distance_mm < half
-        else ""
-    )
-
-
-def dry_run(
-    settings: Config,
-    runs: Path | None = None,
-    remaining: Remaining = all_of,
-    whole: Collection[float | None] = (),
-    locks: Callable[[Path], str] = no_locks,
-) -> DryRun:
-    """Compute the plan of a configuration without devices.
-
-    Args:
-        runs: where the file would be, for the free disk space; default: the configured folder.
-        remaining: the part of the plan that is still to be taken.
-        whole: energies (keV) or numbers of states of a series whose scans are already complete; never all of them.
-        locks: function that states what is wrong with the file locks of a folder, such as `no_locks`, which writes
-            there.
-
-    Raises:
-        ConfigError: impossible angles, scene or device settings. Exceeded limits are not an error here: they are the
-            violations of the timeline.
-    """
-    each = [one for one in each_scan(settings) if (one.scan.state or one.scan.energy) not in whole]
-    if settings.scan.energies is not None and len(each) > 1:  # a scene is read at both ends of the energy range
-        connect.describe(max(each, key=lambda one: one.scan.energy or 0.0))
-    stage, camera, to_counts = connect.describe(min(each, key=lambda one: one.scan.energy or 0.0))
-    there = disk_of(runs or Path(settings.storage.folder))
-    free = shutil.disk_usage(there).free
-    plans = [remaining(plan_of(one)) for one in each]
-    timelines = [_worked(one, plan, stage, to_counts, camera, free) for one, plan in zip(each, plans, strict=True)]
-    worked = [
-        DryRun(plan, timeline, stage, camera, free, _needs(one, timeline), there)
-        for one, plan, timeline in zip(each, plans, timelines, strict=True)
-    ]
-    worked_plan = _of_series(settings, each, worked) if settings.series else worked[0]
-    return replace(worked_plan, timeline=_lockable(worked_plan.timeline, locks(there)))
-
-
-def _copied(config: Config) -> frozenset[str]:
-    """The names of the kinds of frames that are copied."""
-    return frozenset({FrameKind.DARK.name, FrameKind.FLAT.name} if config.copies_references else ())
-
-
-def _needs(config: Config, timeline: Timeline) -> ScanNeeds:
-    """The needs of one scan. Darks and flats that are copied from the first state take no time."""
-    rate = config.optics.dose_rate_gy_s
-    copied = _copied(config)
-    return ScanNeeds(
-        {part: seconds for part, seconds in timeline.parts.items() if part.upper() not in copied},
-        timeline.n_frames,
-        timeline.total_bytes,
-        dose_gy=None if rate is None else rate * timeline.in_beam,
-        volume_seconds=config.recon.seconds if config.recon.live else 0.0,
-        operator=tuple(_requests(config, timeline)),
-    )
-
-
-def _requests(config: Config, timeline: Timeline) -> Iterator[OperatorRequest]:
-    """What the scan will ask the operator to do."""
-    by_hand, copied = config.devices.by_hand, _copied(config)
-    kinds = [block.kind for block in timeline.blocks if block.n_to_take and block.kind.name not in copied]
-    opened = [None, *(kind is not FrameKind.DARK for kind in kinds), False]  # how it is at first is not known
-    moved_out = [False, *(kind is FrameKind.FLAT for kind in kinds if kind is not FrameKind.DARK), False]
-    for device, states, request in (
-        ("filter", [None, *filter(None, [config.scan.filter])], f"put the filter {config.scan.filter} into the beam"),
-        ("monochromator", [None, *filter(None, [config.scan.energy])], "set the monochromator"),
-        ("shutter", opened, "open or close the shutter"),
-        ("sample_mover", moved_out, "move the sample out of the beam or back"),
-    ):
-        if device in by_hand and (times := sum(before != after for before, after in pairwise(states))):
-            yield OperatorRequest(request, times)
-    if config.scan.decide == "ask":
-        passes = math.ceil(timeline.plan.n_views / (timeline.plan.pass_views or timeline.plan.n_views))
-        yield OperatorRequest("decide what to measure next", max(len(timeline.views.trains), passes))
-
-
-def _of_series(settings: Config, configs: Sequence[Config], each: Sequence[DryRun]) -> DryRun:
-    """The first of several scans, with the needs and the violations of all of them."""
-    states, all_of_them = settings.scan.states, [one.needs for one in each]
-    total = replace(each[0], needs=all_needs(all_of_them))
-    if states is None:
-        sizes = ((one.timeline.duration, one.timeline.total_bytes) for one in each)
-        needs = [EnergyNeeds(one.scan.energy or 0.0, *of) for one, of in zip(configs, sizes, strict=True)]
-        total = replace(total, energies=tuple(needs))
-    else:
-        numbers = [config.scan.state or 0 for config in configs]
-        of_states = [StateNeeds(n, one.duration, one.total_bytes) for n, one in zip(numbers, all_of_them, strict=True)]
-        breaks = sum(max((states.every_s or 0.0) - one.duration, 0.0) for one in all_of_them[:-1])
-        parts = {**total.needs.parts, "wait": breaks}
-        total = replace(total, states=tuple(of_states), every=states.every_s, needs=replace(total.needs, parts=parts))
-    what = "energies" if states is None else "states"
-    violations = dict.fromkeys(limit for one in each for limit in one.timeline.violations)
-    if total.needs.total_bytes * ROOM > total.free_bytes:
-        violations[
-            f"free some space, choose another storage.folder, or set fewer {what}: {len(each)} {what} "
-            f"need {size(total.needs.total_bytes)} plus a tenth, and the disk has {size(total.free_bytes)} free"
-        ] = None
-    return replace(total, timeline=replace(total.timeline, violations=tuple(violations)))
-
-
-def _worked(
-    config: Config,
-    plan: ScanPlan,
-    stage: StageLimits,
-    to_counts: Callable[[float], int],
-    camera: CameraTiming,
-    free: int,
-) -> Timeline:
-    """The timeline, with a remark on the live volume."""
-    axis_col, preview_bin, method = config.optics.axis_col, config.storage.preview_bin, config.recon.chosen_method
-    worked = work_out(plan, stage, to_counts, camera, axis_col=axis_col, preview_bin=preview_bin, free_bytes=free)
-    if not config.recon.live or not streams(method):
-        return worked
-    need = live_need(camera.shape, plan.n_views, free_memory())
-    return replace(worked, remarks=(*worked.remarks, need, *better_order(plan)))
-
-
-def _lockable(worked: Timeline, no_locking: str) -> Timeline:
-    """The plan, with an additional violation if files in its folder cannot be locked."""
-    return replace(worked, violations=(*worked.violations, no_locking)) if no_locking else worked
-
-
-def refuse_violations(worked: Timeline) -> None:
-    """Raise ConfigError with all violated limits, if there are any."""
-    broken = worked.violations
-    if len(broken) == 1:
-        raise ConfigError(f"a limit is exceeded, nothing was started: {broken[0]}.")
-    if broken:
-        raise ConfigError("\n  ".join([f"{len(broken)} limits are exceeded, nothing was started:", *broken]))
-
-
-def disk_of(folder: Path) -> Path:
-    """`folder` if it exists, otherwise its nearest existing parent, which is on the same disk.
-
-    Raises: ConfigError: a file has the name of the folder, or the disk does not exist.
-    """
-    folder = folder.absolute()
-    if link := broken_link(folder):
-        raise ConfigError(
-            f"choose another folder, because runs cannot be written to {folder}: {link} Nothing was started."
-        )
-    there = next((place for place in (folder, *folder.parents) if place.exists()), None)
-    if there is None or not there.is_dir():
-        problem = "no such disk" if there is None else f"a file at {there}"
-        raise ConfigError(
-            f"choose another folder, because runs cannot be written to {folder}: there is {problem}. "
-            "Nothing was started."
-        )
-    return there
+from drivers.base.protocols import CameraSettings, CameraTiming, TriggerSource
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,7 +63,7 @@ def preflight(
     settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.EXTERNAL))
     timing, disk = camera.timing, disk_of(runs)
     free = shutil.disk_usage(disk).free
-    timeline = _lockable(_worked(config, plan, stage.limits, stage.to_counts, timing, free), no_locks(disk))
+    timeline = lockable(worked_with(config, plan, stage.limits, stage.to_counts, timing, free), no_locks(disk))
     refuse_violations(timeline)
     ready = ready_scan(config, timeline, settings, timing, _info(config, instrument, plan, timeline), check_stop)
     if instrument.simulated is not None:

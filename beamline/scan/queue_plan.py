@@ -15,13 +15,14 @@ from beamline.core.text import aligned, count, size
 from beamline.plan.limits import ROOM
 from beamline.plan.needs import NOTHING, ScanNeeds, all_needs
 from beamline.plan.timeline import hms_text
-from beamline.scan.preflight import DryRun
+from beamline.scan.dry_run import DryRun
 
 
 @dataclass(frozen=True)
 class ScanFault:
-    """The reason why a scan cannot run, as a sentence. file, line: place of the value in a file. None: the value is not
-    in a file, or the sentence concerns several lines."""
+    """The reason why a scan cannot run, as a sentence. file, line: place of the value in a file; None if the value is
+    not in a file, or if the sentence is about several lines.
+    """
 
     message: str
     file: str | None = None
@@ -110,11 +111,11 @@ class QueuePlan:
 
     def refuse_impossible(self) -> None:
         """Raise ConfigError with all faults of all scans, if there are any. Nothing was started."""
-        found = [_named(scan, fault) for scan in self.scans for fault in scan.faults]
-        if found or self.faults:
+        of_scans = [_named(scan, fault) for scan in self.scans for fault in scan.faults]
+        if of_scans or self.faults:
             bad = count(sum(not scan.valid for scan in self.scans), "scan")
-            what = f"{bad} of {len(self.scans)} cannot run" if found else "the scans do not fit on the disk"
-            lines = [f"\n  {line}" for line in (*found, *map(str, self.faults))]
+            what = f"{bad} of {len(self.scans)} cannot run" if of_scans else "the scans do not fit on the disk"
+            lines = [f"\n  {line}" for line in (*of_scans, *map(str, self.faults))]
             raise ConfigError("".join([f"Nothing was started, because {what}:", *lines]))
 
 

@@ -15,7 +15,7 @@ from beamline.config.tree import Override
 from beamline.core.errors import ConfigError, DataError, user_message
 from beamline.core.files import SETTINGS, TABLE, text_in
 from beamline.core.text import count
-from beamline.scan.preflight import doubts, dry_run
+from beamline.scan.dry_run import doubts, dry_run
 from beamline.scan.queue_plan import PlannedScan, QueuePlan, ScanFault, queue_of
 from beamline.storage.writer_lock import no_locks
 
@@ -49,10 +49,10 @@ def plan_queue(
 
     def planned(source: str, file: Path, own: Sequence[Override]) -> PlannedScan:
         try:
-            found = read_config(file, (*own, *overrides), rehearse=rehearse, no_live=no_live)
+            read = read_config(file, (*own, *overrides), rehearse=rehearse, no_live=no_live)
         except (ConfigError, DataError, OSError) as error:
             return PlannedScan(source, faults=_faults_of(error, str(file)))
-        return plan_of_config(found.config, place, source, found, locks)
+        return plan_of_config(read.config, place, source, read, locks)
 
     described = (scan for each in scans for scan in _described(each))
     return queue_of(scan if isinstance(scan, PlannedScan) else planned(*scan) for scan in described)
@@ -122,7 +122,7 @@ def plan_of_config(
         place, source: as in `plan_queue` and `PlannedScan`. read: the configuration with the places of its values and
             its faults; None: no faults are known. locks: as in `dry_run`.
     """
-    faults = [] if read is None else [_placed_at(at, sentence) for at, sentence in read.faults]
+    faults = [] if read is None else [_placed_at(place_of_value, sentence) for place_of_value, sentence in read.faults]
     planned = PlannedScan(source, config.sample.name, config=config)
     try:
         unusual = doubts(config)

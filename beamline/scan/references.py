@@ -80,8 +80,8 @@ class ReferenceLog:
             for block in planned
             if block.kind in REFERENCES and not self.evidence.of_kind(block.kind)
         }
-        found = (finding for finding in reference_findings(self.evidence, limits) if finding.frames)
-        return missing | {f"{finding.rule} {spans(finding.frames)}": finding.message for finding in found}
+        findings = (finding for finding in reference_findings(self.evidence, limits) if finding.frames)
+        return missing | {f"{finding.rule} {spans(finding.frames)}": finding.message for finding in findings}
 
     def too_few_photons(self, limits: ReferenceLimits, exposure: float) -> str | None:
         """A warning if noise would dominate the projections because a pixel in the open beam gets few photons;
@@ -89,16 +89,16 @@ class ReferenceLog:
         bad = {row for finding in reference_findings(self.evidence, limits) for row in finding.frames}
         good = self.evidence.without(bad)
         flats, darks = (next(iter(good.of_kind(kind)), None) for kind in (FrameKind.FLAT, FrameKind.DARK))
-        found = photons(flats, darks) if flats and darks else None
-        if not flats or found is None:
+        n_photons = photons(flats, darks) if flats and darks else None
+        if not flats or n_photons is None:
             return None
-        found *= exposure / flats[0].exposure if flats[0].exposure > 0 else 1.0
-        if not found < FEW_PHOTONS:
+        n_photons *= exposure / flats[0].exposure if flats[0].exposure > 0 else 1.0
+        if not n_photons < FEW_PHOTONS:
             return None
         return (
-            f"Expose for longer (scan.exposure_s={exposure * FEW_PHOTONS / found:.2g}, and scan.period_s "
+            f"Expose for longer (scan.exposure_s={exposure * FEW_PHOTONS / n_photons:.2g}, and scan.period_s "
             "to match), or bin the camera's pixels (devices.camera.binning): the beam is too weak. A "
-            f"pixel of the open beam has {found:.3g} photons per projection (from mean and variance of "
+            f"pixel of the open beam has {n_photons:.3g} photons per projection (from mean and variance of "
             f"the flats {spans([flat.row for flat in flats])}); expected {FEW_PHOTONS} or more, otherwise "
             "noise dominates the volume. `beamline tune` measures it."
         )

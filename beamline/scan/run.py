@@ -30,10 +30,11 @@ from beamline.core.sinks import Announcer, JsonLines, UserLog, fan_out
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.instrument.connect import ConnectedDevices, clock_after, connect
 from beamline.scan.control import NEXT, State, StateMachine, verbs_taken
+from beamline.scan.dry_run import all_of
 from beamline.scan.live_plan import live_plan
 from beamline.scan.live_process import Commands, LiveCommand, Standby, follow_command, reconstruct
 from beamline.scan.measurement import FrameSource, Measurement, Turn
-from beamline.scan.preflight import ReadyScan, all_of, preflight
+from beamline.scan.preflight import ReadyScan, preflight
 from beamline.scan.references import first_state
 from beamline.scan.resume import ResumableRun
 from beamline.scan.runs import record_sink
@@ -59,19 +60,20 @@ def run_scan(
     """Run the scan that `config` describes.
 
     Args:
-        runs: the folder in which the run gets its own; default: the configured one. Or the run that is continued, with
-            its own configuration.
-        sinks: in addition to events.jsonl and user.log in the run's folder.
-        stop: ends the scan from another thread or a signal handler.
-        live: gives the command line of a live reconstruction, or the commands for the scan; None: there is none.
+        runs: folder in which the folder of the run is created; default: the configured folder. Or the run that is
+            continued, with its own configuration.
+        sinks: receive the events, in addition to events.jsonl and user.log in the folder of the run.
+        stop: request with which another thread or a signal handler ends the scan.
+        live: function that returns the command line of a live reconstruction, or the commands for the scan; None: no
+            live reconstruction.
         turn: see `Measurement`; None: the scan begins at once.
-        instrument: connected devices, left open at the end; None: those that `config` names, opened and closed here.
-        ask: asks the operator, if the shutter or the sample is moved by hand.
+        instrument: connected devices, which stay open; None: the devices in `config` are opened, and closed at the end.
+        ask: function that asks the operator to move the shutter or the sample by hand.
 
     Raises:
-        ConfigError: the plan exceeds a limit, or the instrument differs from that with which the run began; nothing has
+        ConfigError: the plan exceeds a limit, or the instrument is not the one with which the run began. Nothing has
             moved.
-        DeviceError, InstrumentError: a device failed. ScanStopped, ScanAborted: it was requested.
+        DeviceError, InstrumentError: a device failed. ScanStopped, ScanAborted: a stop or an abort was requested.
         ReferencesError: darks or flats cannot be used; no projection was taken.
         DataError: frames are missing (LedgerError), or the disk failed. In all of these cases the frames taken so far
             are in the file. The event `scan_done` gives their number, and `failed` gives the reason.
@@ -141,7 +143,8 @@ def record_scan(
             returns the command line of a live reconstruction; None: no live reconstruction.
 
     Raises:
-        LedgerError: frames are missing. ScanStopped, ScanAborted: it was requested. DataError: the disk failed.
+        LedgerError: frames are missing. ScanStopped, ScanAborted: a stop or an abort was requested. DataError: the disk
+            failed.
     """
     began = time.monotonic()
     others = ConnectedDevices(cast(Devices, None), SystemClock(), None, lambda: None)  # its devices are never used

@@ -97,7 +97,7 @@ def describe(run: Path) -> Run:
         planned=None if records[-1].planned is None or earlier is None else earlier + records[-1].planned,
         flags=flags,
         state=state,
-        bytes=sum(_size(Path(at, name)) for at, _, names in os.walk(run) for name in names),
+        bytes=sum(_size(Path(folder, name)) for folder, _, names in os.walk(run) for name in names),
         parts=len(parts),
         next_step=next_step(run / SCAN) if state in (DIED, NOT_KNOWN) else "",
         ended=next((record.ended for record in records if record.ended), ""),

@@ -1,4 +1,5 @@
-"""Series: scans of one sample, one at each energy or of each state, in one folder; the series can be continued later.
+"""Series: takes scans of one sample, one scan at each energy or of each state, in one folder. A series can be continued
+later.
 
 Each scan has an ordinary run folder within the folder of the series, so that every program that reads runs can read it.
 """
@@ -19,10 +20,10 @@ from beamline.core.sinks import Warn, fan_out
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import clock_after, connect
 from beamline.scan.control import State
+from beamline.scan.dry_run import dry_run, refuse_violations
 from beamline.scan.exposures import SLICE
 from beamline.scan.live_process import Commands, reconstruct
 from beamline.scan.measurement import Measurement
-from beamline.scan.preflight import dry_run, refuse_violations
 from beamline.scan.resume import (
     NoFrame,
     NothingMissing,
@@ -45,9 +46,9 @@ class SeriesRun:
     """A finished series.
 
     Attributes:
-        folder: of the series.
-        scans: keV of each energy, or number of each state, and its scan file.
-        results: of the scans that were taken now.
+        folder: folder of the series.
+        scans: the scan file of each energy (keV), or of each state (number).
+        results: results of the scans that were taken now, not earlier.
     """
 
     folder: Path
@@ -63,13 +64,13 @@ def is_series(folder: Path) -> bool:
 
 
 def scans_in(folder: Path, warn: Warn) -> list[Path]:
-    """The scan file of each energy or state of a series that has one, in the order of the configuration.
+    """The scan files of a series, by energy or number of the state, in the order of the configuration.
 
     Args:
-        warn: function that gets a sentence on scans that are incomplete or do not exist.
+        warn: function that gets a sentence about scans that are incomplete or do not exist.
 
     Raises:
-        DataError: there is no scan.
+        DataError: the series contains no scan.
     """
     config = load(folder / CONFIG, environment={})
     runs = _runs(folder, config)
@@ -88,7 +89,7 @@ def scans_in(folder: Path, warn: Warn) -> list[Path]:
 
 
 def scans_of(paths: Iterable[Path], warn: Warn) -> tuple[Path, ...]:
-    """The scans at these paths; the folder of a series stands for its scans, see `scans_in`."""
+    """The scans at these paths. The folder of a series is replaced by its scans, see `scans_in`."""
     return tuple(scan for path in paths for scan in (scans_in(path, warn) if is_series(path) else [scan_file(path)]))
 
 
@@ -102,19 +103,20 @@ def run_series(
     series: Path | None = None,
     ask: Ask | None = None,
 ) -> SeriesRun:
-    """Run the scans of a series in turn; devices stay connected.
+    """Run the scans of a series one after the other. Devices stay connected.
 
     Args:
-        place: the folder in which the series gets its own; None: the configured one.
-        stop: ends the current scan, and with it the series. `sinks`, `ask`: as in `run_scan`, for all scans.
-        commands: of the reconstruction of each scan. If a volume needs the complete scan of a state, it is made after
-            the last state, because the next state would have to wait for it.
-        series: the folder of a series to be continued: complete scans are kept, and a scan that ended early is
-            continued.
+        place: folder in which the folder of the series is created; None: the configured folder.
+        stop: request that ends the current scan and with it the series. `sinks`, `ask`: as in `run_scan`, for all
+            scans.
+        commands: function that returns the commands for the reconstruction of a scan. If a volume needs the complete
+            scan of a state, it is made after the last state, so that the next state need not wait for it.
+        series: folder of a series that is continued. Complete scans are kept, and a scan that ended early is continued.
 
     Raises:
-        ConfigError: a limit is exceeded at one of the scans; nothing has moved. What `run_scan` raises: the scans
-            before it are complete, and a warning names the folder with which the series can be continued.
+        ConfigError: a limit is exceeded at one of the scans; nothing has moved. Also raises the errors of `run_scan`:
+            the scans before the error are complete, and a warning names the folder with which the series can be
+            continued.
     """
     each, send = each_scan(config), fan_out(*sinks)
     with ExitStack() as held:
@@ -167,14 +169,15 @@ def run_series(
 
 @dataclass
 class _Turns:
-    """When each state begins: `every` s after the one before, or (None) when `beamline resume` is sent. The first one
-    begins at once."""
+    """Decides when each state begins: `every` s after the beginning of the state before, or (None) when `beamline
+    resume` is sent. The first state begins at once.
+    """
 
     every: float | None
     last: float | None = field(default=None, init=False)
 
     def wait(self, measurement: Measurement, poll: Callable[[], bool]) -> None:
-        """Wait until the scan may begin; a stop ends the wait, and a pause prolongs it."""
+        """Wait until the scan may begin. A stop ends the wait, and a pause makes it longer."""
         clock, stop, pause, states = (
             measurement.instrument.clock, measurement.stop, measurement.pause, measurement.states,
         )  # fmt: skip
@@ -186,8 +189,8 @@ class _Turns:
                 due = clock.now()
             else:
                 states.enter(states.state, f"{name} begins in {-late:.0f} s")
-            while (left := due - clock.now()) > 0 and not stop.stopping:
-                clock.sleep(min(SLICE, left))
+            while (remaining := due - clock.now()) > 0 and not stop.stopping:
+                clock.sleep(min(SLICE, remaining))
         elif self.last is not None:
             pause.pause(f"{name} waits for its trigger")
         if self.last is not None and pause.reason and not stop.stopping:
@@ -201,7 +204,7 @@ class _Turns:
 
 
 def _within(one: Config, seconds: float | None) -> Config:
-    """The configuration of a state whose live volume is finished before the next state begins."""
+    """The configuration of a state, changed so that its live volume is finished before the next state begins."""
     every = one.scan.states.every_s if one.scan.states else None
     if every is None or seconds is None:
         return one
@@ -209,7 +212,7 @@ def _within(one: Config, seconds: float | None) -> Config:
     return changed(one, [override_of("recon.seconds", min(one.recon.seconds, spare))])
 
 
-_LEAST_SECONDS = 1.0  # of the last fit of a live volume
+_LEAST_SECONDS = 1.0  # s for the last fit of a live volume
 
 
 def _volumes(scans: Sequence[tuple[Path, Commands]], stop: StopRequest, sinks: Sequence[Sink]) -> None:
@@ -236,12 +239,12 @@ def _named(one: Config) -> str:
 
 def _new_folder(config: Config, place: Path) -> Path:
     folder = create_run_folder(place, f"{config.sample.name}_{_kind(config)}", SystemClock().now())
-    write_whole(folder / CONFIG, resolved_yaml(config))  # what --resume goes by
+    write_whole(folder / CONFIG, resolved_yaml(config))  # --resume uses this
     return folder
 
 
 def _runs(series: Path, config: Config) -> list[Path | None]:
-    """The newest run folder of each scan of a series; None: there is none."""
+    """The newest run folder of each scan of a series; None for a scan without a run."""
     if not is_series(series):
         raise ConfigError(f"{series} is not the folder of a series of scans. Nothing was changed.")
     run_of_value = dict[float, Path]()
@@ -251,7 +254,9 @@ def _runs(series: Path, config: Config) -> list[Path | None]:
 
 
 def _job(run: Path | None, held: ExitStack) -> Path | ResumableRun | None:
-    """What is left to do for a scan: nothing (its scan file), the rest of a run, or a new scan (None)."""
+    """What must still be done for a scan. Its scan file: nothing, because it is complete. A run: the rest of this run.
+    None: a new scan.
+    """
     if run is None:
         return None
     try:
@@ -274,9 +279,9 @@ def _tell(event: Event, sinks: Sequence[Sink]) -> None:
 def _after_failure(folder: Path, name: str, of: int, sinks: Sequence[Sink]) -> None:
     """Report how the series can be continued; remove its folder if it contains no scan."""
     if any(path.is_dir() for path in folder.iterdir()):
-        at = f"{name[0].lower()}{name[1:]}"
-        said = f"The series of {of} scans ended at {at}. `beamline scan --resume {folder}` continues it."
-        _tell(Warned(said), sinks)
+        scan = f"{name[0].lower()}{name[1:]}"
+        sentence = f"The series of {of} scans ended at {scan}. `beamline scan --resume {folder}` continues it."
+        _tell(Warned(sentence), sinks)
         return
     (folder / CONFIG).unlink()
     folder.rmdir()

@@ -35,36 +35,35 @@ def _wait_in_pause() -> bool:
 class Supervision:
     """Callbacks of the acquisition that pause a scan."""
 
-    # refusal: called once, before the first projection, when all earlier frames are recorded. Returns why no
-    # projection
-    # should be taken; None: projections may be taken
+    # refusal: called once before the first projection, when all earlier frames are recorded. Returns the reason why no
+    # projection should be taken; None: projections may be taken
     refusal: Callable[[], str | None] = lambda: None
-    # pause: checked before each frame of a stage at rest, and continuously while it turns
+    # pause: checked before each frame if the stage is at rest, and continuously while the stage turns
     pause: PauseRequest = field(default_factory=PauseRequest)
     # wait_in_pause: called repeatedly while the scan is paused. It waits a moment, and returns whether the operator at
     # the terminal has ended the pause
     wait_in_pause: Callable[[], bool] = _wait_in_pause
-    # states: told the states of the scan
+    # states: gets each new state of the scan
     states: StateMachine = field(default_factory=lambda: StateMachine(state=State.PREPARING))
-    # retakes: called with the triggers without a frame, after the last projection and where retakes were chosen;
-    # returns the projections that are repeated now
+    # retakes: called with the triggers without a frame, after the last projection, and when retakes were chosen.
+    # Returns the projections that are repeated now
     retakes: Callable[[Sequence[int]], Sequence[Retake]] = lambda missing: ()
-    # wait_for_beam_reading: called after the last frame of flats and projections: returns when it is known whether
-    # there was
-    # beam
+    # wait_for_beam_reading: called after the last frame of flats and of projections. Returns as soon as it is known
+    # whether there was beam
     wait_for_beam_reading: Callable[[], None] = lambda: None
-    # next_pass: called after each pass of projections, offset projections or retakes, if something is left; returns a
-    # possible
-    # choice. It may take its time, and close the shutter, which the next frames open. None: nothing is chosen
+    # next_pass: called after each pass of projections, offset projections or retakes, if something is left to measure.
+    # Returns a possible choice; None: nothing is chosen. It may take long and close the shutter; the next frames open
+    # the shutter again
     next_pass: Callable[[Passes], Choice] | None = None
-    # pass_ended: called before `next_pass`, and after the last pass, too; all frames were delivered
+    # pass_ended: called before `next_pass`, and also after the last pass, when all frames were delivered
     pass_ended: Callable[[], None] = lambda: None
-    # n_retakable: called before `next_pass` with the triggers without a frame; how many projections `retakes` would
-    # return
+    # n_retakable: called before `next_pass` with the triggers without a frame. Returns how many projections `retakes`
+    # would return
     n_retakable: Callable[[Sequence[int]], int] = lambda missing: 0
-    # turn: called before anything moves; returns when the scan may begin
+    # turn: called before anything moves. Returns when the scan may begin
     turn: Callable[[], None] = lambda: None
-    # recorded: frames of a block of darks or flats that another scan has taken; empty: this scan takes its own
+    # recorded: returns frames that another scan has taken, for a block of darks or flats; empty: this scan takes its
+    # own frames
     recorded: Callable[[Block], Sequence[Frame]] = lambda block: ()
 
 
@@ -125,8 +124,8 @@ class BeamLog:
     ) -> None:
         self._monitor, self._period, self._sink, self._react = monitor, period, sink, react
         self._readings: list[BeamReading] = []
-        self._failed = 0  # failed readings in a row
-        self._begun = self._ended = 0  # readings
+        self._failed = 0  # number of consecutive failed readings
+        self._begun = self._ended = 0  # number of readings
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="beam log", daemon=True)
 

@@ -36,7 +36,7 @@ from beamline.instrument.connect import shutter_of
 from drivers.base.clock import Clock, SystemClock
 from drivers.stages.shared import FOUND
 
-PATIENCE = 60.0  # s for each step; a stage cannot be opened while it slows down
+PATIENCE = 60.0  # s for each step, because a stage cannot be opened while it slows down
 BETWEEN = 0.5  # s between attempts
 READY_WITHIN = 60.0  # real s
 # real time in s between signs of life; after a watchdog has died, about this time passes until another one runs
@@ -113,7 +113,7 @@ class _Keeper:
         self._process.end()
 
     def _keep(self, stop: StopRequest, pause: PauseRequest | None) -> None:
-        left = AGAIN
+        restarts_left = AGAIN
         while not self._over.wait(BEAT):
             if self._process.running:
                 self._process.tell()
@@ -128,7 +128,7 @@ class _Keeper:
                 stop.abort(why)
                 return
             self._process.end()
-            if not left:
+            if not restarts_left:
                 self._sink(
                     Warned(
                         f"The new watchdog also ended (code {code}): if the scan is killed now, the shutter stays open."
@@ -137,7 +137,7 @@ class _Keeper:
                 if pause is not None:
                     pause.pause("no watchdog is running")
                 return
-            left -= 1
+            restarts_left -= 1
             with suppress(OSError):
                 self._process = self._started()
             self._sink(Warned(f"The watchdog ended (code {code}); another one is started."))

@@ -1,1 +1,1 @@
-"""Scenes: their files and their ground truth, for all features that use them."""
+"""Files of scenes and their ground truth, for all features that use scenes."""

@@ -1,4 +1,6 @@
-"""Scene files, shipped or from the user, and the ground truth of their samples: attenuation and labels on a grid."""
+"""Reads scene files, from the package or from the user, and computes the ground truth of their samples: attenuation and
+labels on a grid.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ from simulators.scenes.scene import Scene, load_scene
 
 @dataclass(frozen=True, eq=False)
 class SceneFile:
-    """A scene and its file. `text`: of the file, with overridden values, for the record."""
+    """A scene and its file. `text` is the content of the file with the overridden values; it is stored with the
+    results.
+    """
 
     scene: Scene
     path: Path
@@ -40,10 +44,10 @@ class SceneFile:
 
 
 def open_scene(name: str, overrides: Sequence[str] = ()) -> SceneFile:
-    """The scene of a file, or a shipped one by name, with values overridden by KEY=VALUE `overrides`.
+    """The scene in a file, or the scene with this name in the package. `overrides` (KEY=VALUE) replace values.
 
     Raises:
-        ConfigError: there is no such scene, or it is wrong.
+        ConfigError: the scene does not exist, or it is wrong.
         DataError: a volume of the scene cannot be read.
     """
     path, tree, text = _scene_text(name, overrides)
@@ -78,8 +82,8 @@ def _scene_text(name: str, overrides: Sequence[str]) -> tuple[Path, Mapping[str,
     return path, tree.data, yaml.safe_dump(tree.data, sort_keys=False) if overrides else text
 
 
-LARGEST = 256  # Voxels across by default: 256³ take 84 MB with the labels
-BYTES_A_VOXEL = 16  # Peak memory as measured: 12 for solids (float64 and float32), 16 for volumes
+LARGEST = 256  # Default number of voxels across: 256³ voxels with labels take 84 MB
+BYTES_A_VOXEL = 16  # Measured peak memory in bytes per voxel: 12 for solids (float64 and float32), 16 for volumes
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +92,8 @@ class Truth:
 
     Attributes:
         values: float32 [z, y, x]; lengths are in mm.
-        labels: uint8 [z, y, x]; 0 is air, k the k-th of `names`.
-        table: of each particle, lengths from the rotation axis and the middle of the sample.
+        labels: uint8 [z, y, x]; 0 is air, k is the k-th name in `names`.
+        table: a row for each particle. Positions are relative to the rotation axis and the middle of the sample.
     """
 
     grid: Grid
@@ -101,7 +105,9 @@ class Truth:
 
 
 def geometry_of(detector: Detector, angles: NDArray[np.float64]) -> Geometry:
-    """The simulated rays as a reconstruction's geometry; a cone's detector is placed at the sample."""
+    """The simulated rays as the geometry of a reconstruction. For a cone beam, the detector is assumed to be at the
+    sample.
+    """
     if np.isfinite(detector.sod):
         at, row = detector.sod, detector.axis_row
         return Geometry.cone(angles, detector.shape, detector.pitch, at, at, axis_col=detector.axis_col, axis_row=row)
@@ -111,8 +117,8 @@ def geometry_of(detector: Detector, angles: NDArray[np.float64]) -> Geometry:
 
 
 def binning_of(detector: Detector) -> int:
-    """The smallest binning for which a volume has at most LARGEST voxels across, limited by the frame's rows and
-    columns.
+    """The smallest binning with which a volume has at most LARGEST voxels across. It is limited by the number of rows
+    and columns of a frame.
     """
     return max(1, min(-(-max(detector.shape) // LARGEST), *detector.shape))
 
@@ -123,7 +129,7 @@ def memory_of(detector: Detector, binning: int) -> int:
 
 
 def truth_of(sample: Sample, detector: Detector, binning: int) -> Truth:
-    """The truth in voxels of `binning` pixels. Raises ValueError if the binning does not fit the frame."""
+    """The ground truth in voxels of `binning` pixels. Raises ValueError if the binning does not fit the frame."""
     grid = grid_of(detector, binning)
     z, y, x = grid.centre
     shifted = replace(grid, centre=(z + _above(detector, binning), y, x))
@@ -137,8 +143,9 @@ def grid_of(detector: Detector, binning: int) -> Grid:
 
 
 def _above(detector: Detector, binning: int) -> float:
-    """z of a reconstruction's origin in the scene, mm: in a parallel beam the middle of the rows in whole bins, see
-    Geometry.binned."""
+    """z in mm, in the scene, of the origin of a reconstruction. In a parallel beam this is the middle of the rows that
+    form whole bins, see Geometry.binned.
+    """
     if np.isfinite(detector.sod):
         return 0.0
     rows = detector.shape[0] // binning * binning
@@ -147,7 +154,7 @@ def _above(detector: Detector, binning: int) -> float:
 
 def write_truth(path: Path, truth: Truth) -> None:
     """Write an HDF5 file with entry/data/data (read by `beamline recon --truth`), entry/data/labels and, if there is a
-    table, a column for each name in entry/particles; complete or not at all.
+    table, a column for each name in entry/particles. The file is written completely or not at all.
 
     Raises:
         DataError: `path` exists or cannot be written.

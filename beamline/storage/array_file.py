@@ -1,4 +1,4 @@
-"""Arrays of a Zarr, an .npz or an .npy, opened by name like the datasets of an HDF5 file."""
+"""Opens the arrays of a Zarr, .npz or .npy file by name, in the same way as the datasets of an HDF5 file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from beamline.storage import hdf5
 from beamline.storage.packing import packing
 from beamline.storage.structure import require_npy
 
-METADATA = "zarr.json", ".zgroup", ".zarray"  # one of them is in the folder of a Zarr
+METADATA = "zarr.json", ".zgroup", ".zarray"  # the folder of a Zarr store contains one of these files
 
 
 def is_zarr(path: Path) -> bool:
@@ -26,7 +26,7 @@ def is_zarr(path: Path) -> bool:
 
 
 def zarr_library(path: Path) -> Any:
-    """The package zarr. DataError: it is not installed."""
+    """The package zarr. Raises DataError if it cannot be loaded."""
     try:
         import zarr
     except ImportError as error:
@@ -37,11 +37,13 @@ def zarr_library(path: Path) -> Any:
     return zarr
 
 
-_MOST = 1000  # arrays and groups of a Zarr that are looked at
+_MOST = 1000  # most arrays and groups of a Zarr store that are searched
 
 
 class NamedArray:
-    """An array with the interface of an HDF5 dataset: name, file, attrs, shape, dtype, chunks; values by slices."""
+    """An array with the interface of an HDF5 dataset: it has name, file, attrs, shape, dtype and chunks, and a slice of
+    it returns the values.
+    """
 
     is_virtual = False
 
@@ -60,12 +62,12 @@ class NamedArray:
     def __getitem__(self, part: Any) -> Any:
         try:
             return self._values(self.array[part])
-        except Exception as error:  # whatever the codecs of a Zarr raise for a damaged chunk
+        except Exception as error:  # the codecs of a Zarr raise errors of any class for a damaged chunk
             raise OSError(f"{type(error).__name__}: {error}") from error
 
 
 class ArrayFile(dict[str, NamedArray]):
-    """The arrays of a file by their paths; the path "" is the only array of a file."""
+    """The arrays of a file by their paths. If a file has a single array without a name, its path is ""."""
 
     def __init__(self, path: Path) -> None:
         self.filename, self.attrs, self.close = str(path), dict[str, Any](), lambda: None
@@ -90,14 +92,15 @@ class ArrayFile(dict[str, NamedArray]):
 
 
 def numpy_arrays(path: Path, mapped: Literal["r"] | None = None) -> dict[str, NDArray[Any]]:
-    """The arrays of an .npz by name, in memory; the array of an .npy has the name "".
+    """Reads the arrays of an .npz into memory, by name. The array of an .npy has the name "".
 
     Raises:
-        DataError: they do not fit into memory, or some are Python objects.
+        DataError: the arrays do not fit into memory, or some of them contain Python objects.
         ValueError, OSError, ...: a damaged file.
     """
     try:
-        with path.open("rb") as file:  # opened here, for numpy leaves a damaged archive open
+        # opened here, because numpy does not close an archive that turns out to be damaged
+        with path.open("rb") as file:
             if file.peek(1)[:1] == b"\x93":
                 require_npy(file)
                 return {"": np.load(path, mmap_mode=mapped, allow_pickle=False)}
@@ -116,7 +119,7 @@ def numpy_arrays(path: Path, mapped: Literal["r"] | None = None) -> dict[str, ND
 
 
 def require_room(path: Path, n: int) -> None:
-    """Raise DataError if n bytes exceed the free memory, because a damaged file may state any size."""
+    """Raise DataError if `n` bytes exceed the free memory. A damaged file may state any size."""
     if n > (free := free_memory()):
         raise DataError(
             f"{path} does not fit in memory: its header states {n / 1e9:.3g} GB, and {free / 1e9:.3g} GB "
@@ -125,7 +128,7 @@ def require_room(path: Path, n: int) -> None:
 
 
 def open_array_file(path: Path, follow: bool = False) -> Any:
-    """Open a file with named arrays: HDF5, which may still grow, or `ArrayFile`."""
+    """Open a file with named arrays: an HDF5 file, which may still grow, or an `ArrayFile`."""
     return ArrayFile(path) if holds_arrays(path) else hdf5.open_hdf5(path, follow)
 
 
@@ -142,8 +145,8 @@ _PICKLES, _NUMPY = (".pickle", ".pkl", ".pck"), (".npy", ".npz")
 
 
 def holds_arrays(path: Path) -> bool:
-    """True for the path of an .npy, an .npz or a Zarr. Raises DataError for a pickle, whose arrays can be read after a
-    conversion.
+    """True for the path of an .npy, an .npz or a Zarr. Raises DataError for a pickle; the message says how to convert
+    it.
     """
     if path.is_file() and path.suffix.lower() in _PICKLES:
         raise DataError(_PICKLE.replace("{0}", str(path)))

@@ -1,4 +1,4 @@
-"""Datasets of an open HDF5 file: text, numbers with units, links, and frames in any order."""
+"""Reads datasets of an open HDF5 file: text, numbers with units, links, and frames in any order."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LENGTH_UNITS = {  # mm
 ENERGY_UNITS = {"ev": 1e-3, "electronvolt": 1e-3, "kev": 1.0, "kiloelectronvolt": 1.0, "j": _JOULE, "joule": _JOULE}
 WAVELENGTH_UNITS = {"angstrom": 1.0, "å": 1.0, "a": 1.0, "nm": 10.0, "nanometer": 10.0, "pm": 0.01, "m": 1e10}  # Å
 TIME_UNITS = {"s": 1.0, "sec": 1.0, "second": 1.0, "ms": 1e-3, "millisecond": 1e-3, "us": 1e-6}  # s
-_WRITTEN = re.compile(rf"([-+]?{NUMBER})\s*(.*)")  # a number, and perhaps its unit
+_WRITTEN = re.compile(rf"([-+]?{NUMBER})\s*(.*)")  # a number, perhaps followed by its unit
 
 
 def factor_of(unit: str, units: Mapping[str, float]) -> float | None:
@@ -40,18 +40,20 @@ def factor_of(unit: str, units: Mapping[str, float]) -> float | None:
     return units.get(name, units.get(name[:-1]) if name.endswith("s") and len(name) > 3 else None)
 
 
-HELD = 2**28  # bytes of unpacked pieces that are held, so that frames read one by one unpack each piece once
-_CACHE, _SLOTS = 2**20, 521  # bytes and places of the cache that every dataset has
-_FRAMES, _PIXELS = 10**7, 2**31  # far beyond any scan and detector
-_DEEPEST = 12  # groups within another that are looked into
-_UNPACKING = 2  # a filter has its input and its output in memory at once (measured: 1.6 to 2.1 chunks)
-NAME = 1000  # letters of a name or a title
-BRIEF = 2**28  # bytes of a text, a number or a list of a scan
+# bytes of decompressed chunks that stay in memory, so that reading frame by frame decompresses each chunk only once
+HELD = 2**28
+_CACHE, _SLOTS = 2**20, 521  # bytes, and hash slots, of the cache that HDF5 gives to every dataset
+# most frames of a scan, and most pixels of a frame; far above any real scan and detector
+_FRAMES, _PIXELS = 10**7, 2**31
+_DEEPEST = 12  # levels of groups that are searched
+_UNPACKING = 2  # a filter has its input and its output in memory at the same time (measured: 1.6 to 2.1 chunks)
+NAME = 1000  # largest number of letters of a name or a title
+BRIEF = 2**28  # largest number of bytes of a text, a number or a list
 
 
 def text(value: Any) -> str:
-    """A string from HDF5's representations (str, bytes in UTF-8 or Latin-1, or an array of one of these), without
-    control characters.
+    """A string from any form in which HDF5 returns it: str, bytes in UTF-8 or Latin-1, or an array with one of these.
+    Control characters are removed.
     """
     if isinstance(value, np.ndarray):
         value = value.reshape(-1)[0] if value.size else ""
@@ -68,7 +70,7 @@ def attribute(item: h5py.HLObject, name: str) -> str:
 
 
 def text_at(group: h5py.Group, path: str) -> str:
-    """A dataset as text; "" if it is missing, or where `text_of` gives ""."""
+    """A dataset as text; "" if the dataset is missing, or if `text_of` returns ""."""
     item = dataset(group, path)
     return "" if item is None else text_of(item)
 
@@ -79,7 +81,9 @@ def text_of(item: h5py.Dataset) -> str:
 
 
 def arrays_in(file: h5py.File, dimensions: Sequence[int]) -> Iterator[h5py.Dataset]:
-    """Each dataset of numbers with this number of dimensions, once, also behind links."""
+    """Yields each dataset of numbers that has one of these numbers of dimensions. Links are followed, and each dataset
+    is returned once.
+    """
     seen, groups = set(), [(file["/"], 0)]
     while groups:
         group, depth = groups.pop()
@@ -98,12 +102,14 @@ def arrays_in(file: h5py.File, dimensions: Sequence[int]) -> Iterator[h5py.Datas
 
 
 def first_of(item: h5py.Dataset) -> Any:
-    """The first value of a dataset, which may have many; of an empty dataset nothing."""
+    """The first value of a dataset. An empty dataset gives an empty array."""
     return read_part(item, () if (item.size or 0) <= 1 else (0,) * item.ndim)
 
 
 def values_of(item: h5py.Dataset) -> Any:
-    """All values of a number, a text or a list of a scan. Raises DataError if it has more than BRIEF bytes."""
+    """All values of a dataset that contains a number, a text or a list. Raises DataError if the dataset has more than
+    BRIEF bytes.
+    """
     if (n := (item.size or 0) * item.dtype.itemsize) > BRIEF:
         raise DataError(
             f"{item.name} in {item.file.filename} contains {n / 1e9:.3g} GB; expected a number, a text or "
@@ -112,7 +118,8 @@ def values_of(item: h5py.Dataset) -> Any:
     return read_part(item, ())
 
 
-# Filters that The HDF Group has registered and that no package brings on which we depend, by number
+# Filters that are registered with The HDF Group, but that are not in any package on which this program depends, by
+# number
 FILTERS = {
     305: "LZO", 32002: "MAFISC", 32003: "Snappy", 32005: "APAX", 32006: "CBF", 32007: "JPEG-XR", 32009: "SPDP",
     32010: "LPC-Rice", 32011: "CCSDS-123", 32012: "JPEG-LS", 32014: "fpzip", 32016: "B3D", 32019: "JPEG",
@@ -122,10 +129,10 @@ FILTERS = {
 
 
 def read_part(item: Any, where: Any) -> Any:
-    """`item[where]` of a dataset.
+    """Read `item[where]`.
 
     Raises:
-        DataError: a filter with which its values were stored is not installed; the message names it.
+        DataError: the values were stored with a filter that is not installed; the message names the filter.
         OSError: the values cannot be read for another reason.
     """
     try:
@@ -143,30 +150,34 @@ def read_part(item: Any, where: Any) -> Any:
 
 
 def _not_installed(item: h5py.Dataset) -> Iterator[str]:
-    """Filters that are not installed, of a dataset and of those it refers to, each as the beginning of a sentence."""
-    made = item.id.get_create_plist()
-    for number, _, _, said in map(made.get_filter, range(made.get_nfilters())):
+    """The filters that a dataset, or a source of a virtual dataset, needs and that are not installed. Each is the
+    beginning of a sentence.
+    """
+    properties = item.id.get_create_plist()
+    for number, _, _, filter_name in map(properties.get_filter, range(properties.get_nfilters())):
         if not h5py.h5z.filter_avail(number):
-            name = FILTERS.get(number) or one_line(text(said), 40) or "name unknown"
+            name = FILTERS.get(number) or one_line(text(filter_name), 40) or "name unknown"
             yield f"{item.name} in {item.file.filename} is stored with the HDF5 filter {number} ({name})"
-    for name, where in dict.fromkeys(drawn_on(made)) if item.is_virtual else ():
+    for name, where in dict.fromkeys(drawn_on(properties)) if item.is_virtual else ():
         with suppress(DataError, OSError, LookupError), _source_file(item, name) as file:
             yield from _not_installed(file[where])
 
 
 def _source_file(item: h5py.Dataset, name: str) -> AbstractContextManager[h5py.File]:
-    """A file that a virtual dataset names, "." for its own."""
+    """The file of a source of a virtual dataset; "." is the file that contains the virtual dataset."""
     return nullcontext(item.file) if name == "." else open_hdf5(Path(item.file.filename).parent / name)
 
 
 def piece_of(item: h5py.Dataset) -> int:
-    """Bytes that HDF5 decompresses at once: a chunk, or a single value of a dataset without chunks."""
+    """Number of bytes that HDF5 decompresses at once: those of a chunk, or of a single value if the dataset has no
+    chunks.
+    """
     return (math.prod(item.chunks) if item.chunks else 1) * int(item.dtype.itemsize)
 
 
 def bytes_unpacked(item: h5py.Dataset, frames: int | None = 0) -> int:
-    """Bytes that HDF5 decompresses to read one index of the dimension `frames` of a three-dimensional dataset, or all
-    of it (None).
+    """Number of bytes that HDF5 decompresses to read one index of the dimension `frames` of a three-dimensional
+    dataset. None: to read the whole dataset.
     """
     across = item.chunks or [n if axis != frames else 1 for axis, n in enumerate(item.shape)]
     pieces = [1 if axis == frames else -(-n // m) for axis, (n, m) in enumerate(zip(item.shape, across, strict=True))]
@@ -174,7 +185,9 @@ def bytes_unpacked(item: h5py.Dataset, frames: int | None = 0) -> int:
 
 
 def resolve(group: h5py.Group, path: str) -> Any | None:
-    """The object at a path; None if there is none, e.g. after a link to a missing file or in a circle of links."""
+    """The object at a path. None if there is no object, for example because a link points to a missing file, or because
+    links form a circle.
+    """
     try:
         return group[path]
     except (KeyError, OSError, RuntimeError):
@@ -182,7 +195,7 @@ def resolve(group: h5py.Group, path: str) -> Any | None:
 
 
 def broken_link(group: h5py.Group, path: str) -> str:
-    """A sentence if a path ends at a broken link, with the link's target; "" if not."""
+    """A sentence that names the target of the broken link at which a path ends; "" if no link is broken."""
     here: Any = group
     for name in path.strip("/").split("/"):
         if not isinstance(here, h5py.Group):
@@ -202,14 +215,15 @@ def refuse_broken(group: h5py.Group, path: str) -> None:
 
 
 def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | None:
-    """The dataset at a path, unpacked on reading if its numbers are packed; None if it is missing or has a null
-    dataspace.
+    """The dataset at a path. Packed numbers are unpacked when they are read. None if the dataset is missing or has a
+    null dataspace.
 
-    If frames share chunks with other frames, the unpacked chunks of a frame are kept until the next frame is read; if
-    these are too many, those of one row of all frames. `frames` is the number of the frame dimension.
+    A chunk may contain several frames. Then the decompressed chunks of a frame stay in memory until the next frame is
+    read. If these chunks have more than HELD bytes, only the chunks of one row of all frames stay in memory. `frames`
+    is the index of the dimension that counts frames.
 
     Raises:
-        DataError: a list longer than any scan.
+        DataError: the dataset is a list that is longer than any scan.
     """
     item = resolve(group, path)
     if item is None or getattr(item, "shape", None) is None:
@@ -221,15 +235,16 @@ def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | Non
     if (kept := next((size for size in sizes if size <= HELD), 0)) > _CACHE:
         access = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
         access.set_chunk_cache(max(_SLOTS, 8 * kept // piece_of(item)), kept, 0.75)
-        del item  # HDF5 keeps the cache of a dataset that is open
+        del item  # HDF5 keeps the cache settings of a dataset as long as the dataset is open
         item = h5py.Dataset(h5py.h5d.open(group.id, path.encode(), access))
     return unpacked(item)
 
 
 def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | None:
-    """The number in the unit of this program; of a list the median of the positive ones, or else of all.
+    """The number at a path, in the unit of this program. If the dataset is a list, the median of its positive numbers,
+    or of all numbers if none is positive.
 
-    None if `in_units` is None, and if no number is finite.
+    None if `in_units` returns None, or if no number is finite.
     """
     values = in_units(dataset(group, path), units)
     known = np.empty(0) if values is None else values[np.isfinite(values)]
@@ -237,13 +252,14 @@ def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | 
 
 
 def in_units(item: h5py.Dataset | None, units: Mapping[str, float]) -> NDArray[np.float64] | None:
-    """Numbers in the unit of this program, as a list, also if they are written as text, such as "6.5 um".
+    """The numbers of a dataset as a list, in the unit of this program. They may be written as text, such as "6.5 um".
 
     None if there is no dataset of real numbers, or if its unit is unknown or missing.
     """
     values, stated = (None, set[str]()) if item is None else _numbers(item)
     factors = {factor_of(unit, units) for unit in stated or {""}}
-    factor = factors.pop() if len(factors) == 1 else None  # an attribute and a text that disagree say nothing
+    # if the attribute and the text state different units, the unit is unknown
+    factor = factors.pop() if len(factors) == 1 else None
     return None if values is None or factor is None else values * factor
 
 
@@ -251,7 +267,7 @@ def _numbers(item: h5py.Dataset) -> tuple[NDArray[np.float64] | None, set[str]]:
     """The numbers of a dataset as a list (None if it contains none), and the units stated by its attribute and its
     text.
     """
-    stated = {attribute(item, "units") or attribute(item, "angle_unit")} - {""}  # the latter of CIL
+    stated = {attribute(item, "units") or attribute(item, "angle_unit")} - {""}  # CIL writes `angle_unit`
     if item.dtype.kind in "uif":
         return np.ravel(np.asarray(values_of(item), np.float64)), stated
     if item.dtype.kind not in "SO":
@@ -263,11 +279,11 @@ def _numbers(item: h5py.Dataset) -> tuple[NDArray[np.float64] | None, set[str]]:
 
 
 def radians(item: h5py.Dataset, unit: str | None = None, default: str = "") -> NDArray[np.float64]:
-    """Angles in radians, NaN for those that are not finite; a column becomes a list.
+    """The angles of a dataset in radians, as a list; NaN for values that are not finite.
 
     Args:
-        unit: the unit to use, whatever the file states; None: what its attribute `units` and its text state, or
-            `default` if they state none.
+        unit: the unit to use, whatever the file states. None: the unit that the attribute `units` or the text states,
+            or `default` if neither states a unit.
     """
     if lost := missing_links(item):
         raise DataError(
@@ -291,28 +307,31 @@ def radians(item: h5py.Dataset, unit: str | None = None, default: str = "") -> N
 
 
 def copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
-    """Copy all attributes of an object, with their types and shapes; the target must have none of these names."""
+    """Copy all attributes of an object, with their types and shapes. The target must not have attributes with these
+    names.
+    """
     for name in source.attrs:
         given = source.attrs.get_id(name)
-        made = h5py.h5a.create(target.id, name.encode(), given.get_type(), given.get_space())
+        copy = h5py.h5a.create(target.id, name.encode(), given.get_type(), given.get_space())
         if given.get_space().get_simple_extent_type() != h5py.h5s.NULL:
             values = np.empty(given.shape, given.dtype)
             given.read(values)
-            made.write(values)
+            copy.write(values)
 
 
 def missing_links(item: h5py.Dataset, whole: dict[tuple[str, str], bool] | None = None) -> list[str]:
-    """Sources of a virtual dataset, in other files or in the same one, that cannot be read or differ in shape.
+    """The sources of a virtual dataset that cannot be read or have another shape. Sources may be in other files or in
+    the same file.
 
-    For such sources HDF5 silently returns fill values (in another file), or crashes or reads for ever (in its own
-    file).
+    HDF5 does not report such sources. If the source is in another file, HDF5 returns fill values. If it is in the same
+    file, HDF5 crashes or never stops reading.
 
     Args:
-        whole: datasets that are complete, by file and path: each is opened once, however often it is referred to. A
+        whole: the datasets found to be complete so far, by file and path, so that each dataset is opened only once. A
             dataset that refers to itself is not complete.
 
     Raises:
-        DataError: the numbers of sources are packed, but the dataset itself does not say so.
+        DataError: the numbers of a source are packed, but the attributes of the virtual dataset do not say so.
     """
     drawn, packed, lost, whole = dict[tuple[str, str], list[Any]](), list[str](), set(), {} if whole is None else whole
     for each in item.virtual_sources() if item.is_virtual else ():
@@ -349,7 +368,9 @@ def _holds(drawn: h5py.Dataset, source: Any) -> bool:
 
 
 def _fills(drawn: h5py.Dataset, source: Any) -> bool:
-    """True if the shape of a dataset fills its place: some frames, or a stripe or tile of each."""
+    """True if a source fills the part of the virtual dataset that it is assigned to: some frames, or a stripe or tile
+    of each frame.
+    """
     place = source.vspace
     extent = place.shape
     if place.get_select_type() == h5py.h5s.SEL_HYPERSLABS and place.is_regular_hyperslab():
@@ -362,7 +383,7 @@ def require_possible(item: Any) -> int:
     """Bytes of memory that are needed while a chunk of frames [frame, row, col] is unpacked.
 
     Raises:
-        DataError: frames without pixels, or too large for any memory, or for this one.
+        DataError: the frames have no pixels, or they are larger than any detector or than the free memory.
     """
     if 0 in item.shape[1:]:
         raise DataError(f"{item.name} in {item.file.filename} has frames of {item.shape[1]} x {item.shape[2]} pixels.")
@@ -371,7 +392,7 @@ def require_possible(item: Any) -> int:
             f"{item.name} in {item.file.filename} is {' x '.join(map(str, item.shape))}; expected at most {_FRAMES} "
             f"frames of {_PIXELS} pixels."
         )
-    stored = getattr(item, "item", item)  # pieces of a Zarr are packed usually
+    stored = getattr(item, "item", item)  # chunks of a Zarr are usually compressed
     packed = stored.id.get_create_plist().get_nfilters() if isinstance(stored, h5py.Dataset) else bool(stored.chunks)
     if (needed := _UNPACKING * piece_of(item) if packed else 0) > HELD and needed > (free := free_memory()):
         raise DataError(
@@ -384,10 +405,11 @@ def require_possible(item: Any) -> int:
 
 
 def read_frames(item: h5py.Dataset, indices: NDArray[np.int64], rows: slice, out: NDArray[Any]) -> None:
-    """Fill out [frame, row, col] with frames in the requested order; consecutive ones are read at once.
+    """Fill `out` [frame, row, col] with frames in the requested order. Consecutive frames are read together.
 
     Raises:
-        DataError: the frames cannot be read: damaged or missing chunks, or a compression that is not installed.
+        DataError: the frames cannot be read, because chunks are damaged or missing, or because a filter is not
+            installed.
     """
     start = 0
     for first, end in runs(indices):
@@ -402,7 +424,9 @@ def read_frames(item: h5py.Dataset, indices: NDArray[np.int64], rows: slice, out
 
 
 def runs(rows: NDArray[np.integer]) -> list[tuple[int, int]]:
-    """Half-open runs [a, b) of consecutive numbers, in order: 3 4 5 9 -> (3, 6), (9, 10)."""
+    """Yields the runs [a, b) of consecutive numbers, in order; b is not part of the run. Example: 3 4 5 9 gives (3, 6),
+    (9, 10).
+    """
     parts = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
     return [(int(part[0]), int(part[-1]) + 1) for part in parts if part.size]
 

@@ -1,4 +1,6 @@
-"""Files on a disk: Python file objects that HDF5 writes to, unnamed scratch arrays, and fsync in a thread."""
+"""Files on a disk: Python file objects that HDF5 reads and writes, temporary arrays without a file name, and fsync in a
+thread.
+"""
 
 from __future__ import annotations
 
@@ -20,38 +22,40 @@ from beamline.core.files import to_disk
 from beamline.core.text import size
 from beamline.storage.superblock import Superblock, mend_checksum
 
-_KEPT = 2**20  # bytes of a write that HDF5 may read again: it reads larger ones, of voxels, from its own cache
-_ENDLESS = 2**60  # bytes, more than any file grows to
+# largest number of bytes of a write that is kept in memory because HDF5 may read it again; HDF5 reads larger writes
+# (voxels) from its own cache
+_KEPT = 2**20
+_ENDLESS = 2**60  # bytes; larger than any file can become
 
 
 class UnderHdf5:
-    """The interface of a file for HDF5 to read: position, length, bytes.
+    """A file object with the methods that HDF5 needs to read: position, length, bytes.
 
-    HDF5 shares nothing between two of these, even for the same file.
+    HDF5 does not share data between two such objects, even if they belong to the same file.
     """
 
     def __init__(self, path: Path, mode: str, length: int = 0) -> None:
         self.path, self._file = path, FileIO(path, mode)
-        self._at, self._size = 0, max(length, os.fstat(self._file.fileno()).st_size)
+        self._position, self._size = 0, max(length, os.fstat(self._file.fileno()).st_size)
 
     def __del__(self) -> None:
         if file := vars(self).get("_file"):
             file.close()
 
     def __repr__(self) -> str:
-        return str(self.path)  # which is the name of the file for HDF5
+        return str(self.path)  # HDF5 uses this text as the name of the file
 
     def seek(self, offset: int, whence: int = SEEK_SET) -> int:
-        self._at = offset + {SEEK_SET: 0, SEEK_CUR: self._at, SEEK_END: self._size}[whence]
-        return self._at
+        self._position = offset + {SEEK_SET: 0, SEEK_CUR: self._position, SEEK_END: self._size}[whence]
+        return self._position
 
     def tell(self) -> int:
-        return self._at
+        return self._position
 
     def readinto(self, buffer: Any) -> int:
-        """Read into a buffer; zeros if nothing was written yet."""
+        """Read into a buffer. Bytes that were not written yet are zero."""
         out = memoryview(buffer).cast("B")
-        self._read(self._at, out)
+        self._read(self._position, out)
         return len(out)
 
     def read(self, n: int) -> bytes:
@@ -81,9 +85,10 @@ class UnderHdf5:
 
 
 class GrowingFile(UnderHdf5):
-    """A file that this program is writing, or wrote until it was killed, presented as if it were closed.
+    """A file that a program is writing, or was writing when it was killed. HDF5 sees it as a closed file.
 
-    A refresh by HDF5 finds its present state. Blocks that are half written are read as whole ones.
+    When HDF5 refreshes, it sees the present state of the file. Blocks that are half written are repaired in memory
+    while they are read.
     """
 
     def __init__(self, path: Path, head: Superblock) -> None:
@@ -122,16 +127,16 @@ class DiskFile(UnderHdf5):
 
     def write(self, buffer: Any) -> int:
         data, put = memoryview(buffer).cast("B"), 0
-        self._size = max(self._size, self._at + len(data))
+        self._size = max(self._size, self._position + len(data))
         try:
             if self._error is None:
-                self._file.seek(self._at)
+                self._file.seek(self._position)
                 while put < len(data):
                     put += self._file.write(data[put:])
-        except BaseException as error:  # also a signal: HDF5 cannot pass it on
+        except BaseException as error:  # includes a signal: HDF5 cannot pass it on
             self.keep(error)
         if self._error is not None and len(data) <= _KEPT:
-            self._since.append((self._at, bytes(data)))
+            self._since.append((self._position, bytes(data)))
         return len(data)
 
     def truncate(self, size: int) -> int:
@@ -150,7 +155,7 @@ class DiskFile(UnderHdf5):
     def require_taken(self) -> None:
         """Raise the first error recorded so far: OSError if the disk failed."""
         error = self._error
-        if isinstance(error, OSError):  # HDF5's own have no number
+        if isinstance(error, OSError):  # errors of HDF5 itself have no number
             raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(self.path)) from error
         if error is not None:
             raise error
@@ -170,14 +175,14 @@ def scratch_array(folder: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
         DataError: the disk does not have enough free space.
     """
     wanted = 4 * int(np.prod(shape, dtype=np.int64))
-    with tempfile.TemporaryFile(dir=folder) as file:  # the map keeps it open
+    with tempfile.TemporaryFile(dir=folder) as file:  # the memory map keeps the file open
         reserve(file.fileno(), wanted, folder)
         return np.memmap(file, np.float32, "r+" if os.fstat(file.fileno()).st_size == wanted else "w+", shape=shape)
 
 
 def reserve(descriptor: int, wanted: int, folder: Path) -> None:
-    """Allocate `wanted` bytes for an open file in the folder, if the system can. Then missing space is found now and
-    not during the work.
+    """Allocate `wanted` bytes for an open file in the folder, if the operating system supports it. Missing disk space
+    is then noticed now, and not during the work.
 
     Raises:
         DataError: the disk does not have enough free space.
@@ -197,9 +202,9 @@ def reserve(descriptor: int, wanted: int, folder: Path) -> None:
             raise DataError(refusal) from error
 
 
-SECONDS = 1.0  # between two calls, at least
+SECONDS = 1.0  # least time in s between two calls
 
-_PATIENCE = 60.0  # s that the last calls may take
+_PATIENCE = 60.0  # s that each of the last calls may take
 
 
 class ToDisk:
@@ -208,8 +213,8 @@ class ToDisk:
     The thread is a daemon: a disk that hangs does not keep the program from ending.
 
     Attributes:
-        failed: the disk failed in a call.
-        rows: written to the file before the last call that succeeded.
+        failed: True if the disk failed in a call.
+        rows: number of rows that were in the file before the last successful call.
     """
 
     def __init__(self, handle: int) -> None:
@@ -242,7 +247,7 @@ class ToDisk:
         """Wait until everything is on the disk.
 
         Raises:
-            OSError: it did not take it, or not within a minute a call.
+            OSError: the disk failed, or one of the last calls took more than a minute.
         """
         for last in (self._thread, self._call(rows)):
             if last is None:

@@ -20,12 +20,12 @@ SCORES = "/entry/frame_log/flag_scores"
 REGIONS = "/entry/frame_log/flag_regions"
 VALID = "/entry/frame_log/frame_valid"
 LEGEND = "/entry/frame_log/flag_legend"
-NOWHERE = (-1, -1, -1, -1)  # the region of a flag that has none
+NOWHERE = (-1, -1, -1, -1)  # the region of a flag that has no region
 
 
 @dataclass(frozen=True)
 class FlagBit:
-    """A check in a legend; see beamline.monitor.check.Check."""
+    """A check of the monitor, as the legend of a file lists it; see beamline.monitor.check.Check."""
 
     name: str
     bit: int
@@ -42,10 +42,11 @@ class Mark:
     """The flags of a frame in its row of a scan file.
 
     Attributes:
-        bits: as `beamline.monitor.checks.bitmask` makes them.
+        bits: one bit for each check and level, see `beamline.monitor.checks.bitmask`.
         scores: float32 [check], in the order of the legend; NaN if the check did not flag the frame, or flagged it only
             after later frames.
-        regions: int32 [check, 4], first row, row after the last, first column, column after the last; -1: none.
+        regions: int32 [check, 4], first row, row after the last, first column, column after the last; -1: the check
+            flagged no region.
     """
 
     bits: int
@@ -63,8 +64,8 @@ def mark_of(flags: Iterable[Flag]) -> Mark:
     flags = [flag for flag in flags if flag.level is not Level.INFO]
     scores, regions = np.full(len(CHECKS), np.nan, np.float32), np.full((len(CHECKS), 4), -1, np.int32)
     for flag in flags:
-        at = _PLACES[flag.check]
-        scores[at], regions[at] = flag.score, flag.region or NOWHERE
+        place = _PLACES[flag.check]
+        scores[place], regions[place] = flag.score, flag.region or NOWHERE
     return Mark(bitmask(flags), scores, regions)
 
 
@@ -74,7 +75,7 @@ def place_of(flag: Flag) -> int:
 
 
 _PLACES = {check.name: i for i, check in enumerate(CHECKS)}
-UNMARKED = mark_of(())  # The value of a frame that no check flagged
+UNMARKED = mark_of(())  # the mark of a frame that no check flagged
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +83,10 @@ class FrameFlags:
     """The monitor's flags of the frames of a scan.
 
     Attributes:
-        bits: uint64 [frame] as `beamline.monitor.checks.bitmask` makes them.
-        legend: the checks behind the bits.
+        bits: uint64 [frame], one bit for each check and level, see `beamline.monitor.checks.bitmask`.
+        legend: the checks to which the bits belong.
         scores: [frame, check] as in `Mark`.
-        regions: [frame, check, 4], in the same way.
+        regions: [frame, check, 4] as in `Mark`.
     """
 
     bits: NDArray[np.uint64]
@@ -104,41 +105,45 @@ class FrameFlags:
         )
 
     @classmethod
-    def of_flags(cls, found: Sequence[Sequence[Flag]]) -> FrameFlags:
-        """Marks [row] of the frames of a file with these flags; a flag that refers to earlier rows marks these, too."""
-        flags = cls.of_marks([mark_of(flag for flag in each if flag.frame == row) for row, each in enumerate(found)])
-        for flag in chain.from_iterable(found):
-            rows, at = flag.frames, place_of(flag)
+    def of_flags(cls, flags_of_frames: Sequence[Sequence[Flag]]) -> FrameFlags:
+        """The marks of the frames of a file, one for each row. If a flag refers to earlier rows, these rows are marked,
+        too.
+        """
+        flags = cls.of_marks(
+            [mark_of(flag for flag in each if flag.frame == row) for row, each in enumerate(flags_of_frames)]
+        )
+        for flag in chain.from_iterable(flags_of_frames):
+            rows, place = flag.frames, place_of(flag)
             flags.bits[rows.start : rows.stop] |= np.uint64(bitmask([flag]))
             if flag.level is not Level.INFO:
-                flags.scores[flag.frame, at] = flag.score
+                flags.scores[flag.frame, place] = flag.score
                 for row, box in flag.regions().items():
-                    flags.regions[row, at] = box
+                    flags.regions[row, place] = box
         return flags
 
     def mark(self, frame: int) -> Mark:
-        """The row of a frame as the present checks would write it, without checks that no longer exist."""
+        """The mark of a frame in the format of the present checks. Checks that no longer exist are omitted."""
         mark = Mark(0, UNMARKED.scores.copy(), UNMARKED.regions.copy())
         bits, row = 0, int(self.bits[frame])
         for i, entry in enumerate(self.legend):
-            if (at := _PLACES.get(entry.name)) is None or not row >> entry.bit & 1:
+            if (place := _PLACES.get(entry.name)) is None or not row >> entry.bit & 1:
                 continue
-            bits |= 1 << TODAY[at].bit | (row >> entry.alarm_bit & 1) << TODAY[at].alarm_bit
-            mark.scores[at], mark.regions[at] = self.scores[frame, i], self.regions[frame, i]
+            bits |= 1 << TODAY[place].bit | (row >> entry.alarm_bit & 1) << TODAY[place].alarm_bit
+            mark.scores[place], mark.regions[place] = self.scores[frame, i], self.regions[frame, i]
         return replace(mark, bits=bits)
 
     def of_today(self) -> FrameFlags:
-        """The same flags with the bits of the present version, without checks that no longer exist."""
+        """The same flags with the bits of the present version. Checks that no longer exist are omitted."""
         return FrameFlags.of_marks([self.mark(frame) for frame in range(self.bits.size)])
 
     @property
     def flagged(self) -> NDArray[np.bool_]:
-        """True if a check flagged each frame [frame], at any level."""
+        """bool [frame], True for each frame that a check flagged at any level."""
         return np.asarray(self.bits != 0)
 
     @property
     def alarmed(self) -> NDArray[np.bool_]:
-        """True if a check raised an alarm for each frame [frame]."""
+        """bool [frame], True for each frame with an alarm."""
         mask = sum(1 << entry.alarm_bit for entry in self.legend)
         return np.asarray((self.bits & np.uint64(mask)) != 0)
 
@@ -147,7 +152,7 @@ class FrameFlags:
         return FrameFlags(self.bits[frames], self.legend, self.scores[frames], self.regions[frames])
 
     def of_groups(self, groups: Sequence[Sequence[int]]) -> FrameFlags:
-        """The combined flags of the frames of each group: scores farthest from 0, regions as the box around theirs."""
+        """The combined flags of each group of frames: the scores farthest from 0, and the box around all regions."""
         each = (("bits", np.bitwise_or.reduce), ("scores", _greatest), ("regions", _box_around))
         columns: dict[str, Any] = {}
         for name, of_group in each:
@@ -158,10 +163,10 @@ class FrameFlags:
 
     @classmethod
     def joined(cls, each: Sequence[FrameFlags | None], sizes: Sequence[int] | NDArray[np.int64]) -> FrameFlags | None:
-        """The flags of several scans, one after another, given the number of frames of each; None for scans that no
-        monitor checked.
+        """The flags of several scans, one after the other. The arguments include the number of frames of each scan.
+        Flags are None for a scan that the monitor did not check.
 
-        If all have the same legend it is kept, otherwise the present one is used.
+        If all scans have the same legend, the result has this legend. Otherwise it has the present legend.
         """
         known = [flags for flags in each if flags is not None]
         if not known:
@@ -188,7 +193,9 @@ class FrameFlags:
         return np.flatnonzero(alarms if level is Level.ALARM else self.bits >> entry.bit & 1 & ~alarms)
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Frames by check and level, for the checks and levels that flagged any; a frame counts at its worst level."""
+        """Number of flagged frames by check and level, without zeros. A frame counts once per check, at its worst
+        level.
+        """
         counted: dict[str, dict[str, int]] = {}
         for entry in self.legend:
             by_level = {level: self.rows(entry, level).size for level in (Level.WARN, Level.ALARM)}
@@ -198,13 +205,13 @@ class FrameFlags:
 
 
 def _greatest(scores: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[check] the scores [frame, check] farthest from 0; NaN if no frame has one."""
-    at = np.where(np.isfinite(scores), np.abs(scores), -1).argmax(axis=0)
-    return np.asarray(scores[at, np.arange(scores.shape[1])])
+    """[check] the score farthest from 0 among the scores [frame, check]; NaN if no frame has a score."""
+    frame = np.where(np.isfinite(scores), np.abs(scores), -1).argmax(axis=0)
+    return np.asarray(scores[frame, np.arange(scores.shape[1])])
 
 
 def _box_around(regions: NDArray[np.int32]) -> NDArray[np.int32]:
-    """[check, 4] the box around regions [frame, check, 4]; -1 if no frame has one."""
+    """[check, 4] the box around the regions [frame, check, 4]; -1 if no frame has a region."""
     there = regions[..., :1] >= 0
     low = np.where(there, regions, np.iinfo(np.int32).max).min(axis=0)
     high = regions.max(axis=0)
@@ -213,7 +220,7 @@ def _box_around(regions: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 TODAY = tuple(FlagBit(check.name, check.bit, check.unit, check.meaning) for check in CHECKS)
-"""The legend of a file that is written now."""
+"""The legend of the present checks, which new files get."""
 
 
 def counted(counts: Mapping[str, Mapping[str, int]]) -> str:
@@ -223,7 +230,7 @@ def counted(counts: Mapping[str, Mapping[str, int]]) -> str:
 
 
 def write_legend(file: h5py.File) -> None:
-    """Write the legend of all checks, one row for each check; before SWMR writing begins."""
+    """Write the legend of all checks, one row for each check. Call it before SWMR writing begins."""
     file[FLAGS].attrs["description"] = "bits of the monitor's checks, see flag_legend; 0: no check flagged the frame"
     group = file.create_group(LEGEND)
     group.attrs["NX_class"] = "NXcollection"
@@ -262,7 +269,7 @@ def read_flags(file: h5py.File, n: int) -> FrameFlags:
     """The flags of the first `n` frames of a scan file of this program, which may still be growing.
 
     Raises:
-        ValueError: a dataset of them has another shape than the frames and the legend.
+        ValueError: the shape of a dataset of flags does not fit the number of frames and the legend.
     """
     legend = read_legend(file)
     scores, regions = _read(file, SCORES, (n, len(legend))), _read(file, REGIONS, (n, len(legend), 4))

@@ -1,6 +1,6 @@
-"""Volumes in a Zarr of another program, versions 2 and 3 with any codec, read with the zarr library.
+"""Reads volumes from the Zarr files of other programs with the zarr library: versions 2 and 3, any codec.
 
-Axes, scales and units are those of ngff.openmicroscopy.org, 0.4 and 0.5; translations are left out.
+Axes, scales and units follow ngff.openmicroscopy.org, versions 0.4 and 0.5. Translations are ignored.
 """
 
 from __future__ import annotations
@@ -60,15 +60,17 @@ class ZarrScale:
         lead = (0,) * (self.array.ndim - 3)
         try:
             return np.asarray(self.array[(*lead, *parts, *[slice(None)] * (3 - len(parts)))])
-        except Exception as error:  # whatever its codecs raise for a damaged chunk
+        except Exception as error:  # the codecs raise errors of any class for a damaged chunk
             raise DataError(f"{self.path} cannot be read ({type(error).__name__}: {error}).") from error
 
 
 def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacing | None]:
-    """The finest scale of an OME-Zarr with the coarser ones, or the array `dataset`; voxel size in mm, if stated.
+    """The finest scale of an OME-Zarr, with its coarser scales; or the array `dataset`. Also the voxel size in mm, if
+    it is stated.
 
     Raises:
-        DataError: no library, not readable, no volume, or several channels or times.
+        DataError: the zarr library is missing, the file is not readable, it contains no volume, or it contains several
+            channels or times.
     """
     zarr = zarr_library(path)
     try:
@@ -115,7 +117,7 @@ def _require_chunks(path: Path, array: Any) -> None:
 
 
 def _spacing(image: Mapping[str, Any], axes: int, name: str) -> Spacing | None:
-    """None if a unit or the size is not stated."""
+    """The voxel size in mm; None if the size or a unit is not stated."""
     (mine,) = [each for each in image.get("datasets", []) if each["path"] == name] or [{}]
     steps = [*mine.get("coordinateTransformations", []), *image.get("coordinateTransformations", [])]
     scales = [numbers_of(step["scale"], axes, "scale")[-3:] for step in steps if step["type"] == "scale"]
@@ -127,8 +129,8 @@ def _spacing(image: Mapping[str, Any], axes: int, name: str) -> Spacing | None:
 
 
 def is_halved(finest: tuple[int, ...], array: Any) -> bool:
-    """True if repeated halving of one shape gives the shape of an array, along each axis, rounded either way."""
-    shape = getattr(array, "shape", ())[-3:]  # a group has none
+    """True if the shape of an array results from halving `shape` repeatedly along each axis, rounded up or down."""
+    shape = getattr(array, "shape", ())[-3:]  # a group has no shape
     if len(shape) < 3 or min(*shape, *finest) < 1:
         return False
     steps = [2 ** round(np.log2(n / m)) for n, m in zip(finest, shape, strict=True)]

@@ -21,18 +21,18 @@ _NONE, _FIRST = np.zeros(0, np.int64), np.zeros(1, np.int64)
 
 @dataclass(frozen=True, eq=False)
 class FrameTable:
-    """The frames of a scan. Frames are selected and reordered by `take`, and joined by `concat`.
+    """The frames of a scan. `take` selects and reorders frames; `concat` joins tables.
 
-    Nothing is guessed: an unknown value of a frame is NaN or -1, and a column that a scan does not have is None. Arrays
-    are never changed: `dataclasses.replace` makes a table with other columns.
+    No value is guessed: an unknown value of a frame is NaN or -1, and a column that the scan does not have is None.
+    Arrays are never changed: `dataclasses.replace` makes a table with other columns.
 
     Attributes:
         kinds: int32 [frame], values of FrameKind.
         angles: float64 [frame], radians.
         exposures: float64 [frame], s.
-        triggers: int64 [frame], as in `Frame`; -1 if the record of a frame cannot be trusted.
-        framestamps: int64 [frame], the camera's own counter.
-        altered: bool [frame], True if the record differs from its checksum: such frames are INVALID.
+        triggers: int64 [frame], as in `Frame`; -1 if the record of a frame differs from its checksum.
+        framestamps: int64 [frame], number that the camera gives to each frame.
+        altered: bool [frame], True if the record of the frame differs from its checksum. These frames are INVALID.
         part_starts: int64 [part], ascending, the first row of each part; [0] if the scan was not interrupted. Between
             two parts beam and camera may have changed.
         pass_ends: int64 [pass], rows at the end of each pass of projections; empty if the scan has none.
@@ -43,7 +43,7 @@ class FrameTable:
         shifts: float64 [frame, 2], displacement of the image along (columns, rows) in pixels.
         energies: float64 [frame], keV.
         currents: float64 [frame], ring current, or another reading of a beam monitor, in its own unit.
-        flags: of the monitor.
+        flags: flags of the monitor.
     """
 
     kinds: NDArray[np.int32]
@@ -67,7 +67,9 @@ class FrameTable:
     def of(
         cls, kinds: ArrayLike, angles: F64 | None = None, exposures: F64 | None = None, **columns: Any
     ) -> FrameTable:
-        """A table of frames of these kinds. Columns that are not given are unknown, triggers count within blocks."""
+        """A table of frames of these kinds. Columns that are not given are unknown. Triggers are counted from 0 in each
+        block of frames of one kind.
+        """
         kinds = np.array(kinds, np.int32)
         n = kinds.size
         return cls(
@@ -106,7 +108,7 @@ class FrameTable:
 
     @cached_property
     def offset_views(self) -> I64:
-        """Rows of the projections with the sample aside."""
+        """Rows of the projections for which the sample was moved sideways (laterally offset projections)."""
         return self.of_kind(FrameKind.OFFSET_VIEW)
 
     @cached_property
@@ -125,7 +127,7 @@ class FrameTable:
         return _NONE if self.replaces is None else np.sort(self.replaces[self.replaces >= 0])
 
     def views_of(self, first: int, end: int) -> I64:
-        """Rows of the projections within a range of rows, such as those of a part."""
+        """Rows of the projections in a range of rows, for example in one part of the scan."""
         return self.views[slice(*np.searchsorted(self.views, (first, end)))]
 
     def numbers_taken(self, first: int = 0, kind: int = FrameKind.PROJECTION) -> frozenset[int]:
@@ -134,7 +136,7 @@ class FrameTable:
 
         Args:
             first: the row from which frames count.
-            kind: of frames that count.
+            kind: kind of the frames to count.
         """
         rows, numbers = self.of_kind(kind), set[int]()
         for row in rows[rows >= first].tolist():
@@ -152,7 +154,7 @@ class FrameTable:
         return set(kinds) <= {*self.kinds.tolist()}
 
     def frame(self, row: int, counts: NDArray[np.uint16], kind: FrameKind | None = None) -> Frame:
-        """A frame with all that is known of it; `kind` replaces that of the table."""
+        """A frame with all known values. `kind` replaces the kind in the table."""
         return Frame(
             counts=counts,
             kind=self.kind(row) if kind is None else kind,
@@ -173,27 +175,29 @@ class FrameTable:
         return replace(self, kinds=kinds)
 
     def take(self, rows: I64) -> FrameTable:
-        """The frames of these rows, in that order. A projection that repeats one which is not among them counts as not
-        repeating any.
+        """The frames of these rows, in this order. If a projection repeats a frame that is not selected, the result no
+        longer states that it repeats one.
 
-        Parts and passes are those of the frames that are left, if the rows ascend; in another order they are
-        meaningless.
+        If the rows are ascending, parts and passes are those of the selected frames. In any other order, they have no
+        meaning.
         """
         own: dict[str, Any] = {
             name: None if (column := getattr(self, name)) is None else column[rows] for name in _ARRAYS
         }
         if self.replaces is not None:
-            place = np.full(len(self) + 1, -1)  # its last one is read by -1: repeats none
+            place = np.full(len(self) + 1, -1)  # index -1 reads the last element, which is -1 (repeats no frame)
             place[rows] = np.arange(rows.size)
             own["replaces"] = place[own["replaces"]]
         starts, ends = np.unique(np.searchsorted(rows, self.part_starts)), np.searchsorted(rows, self.pass_ends)
-        starts = starts[(starts < rows.size) | (starts == 0)]  # a part of which no frame is left
+        starts = starts[(starts < rows.size) | (starts == 0)]  # drops parts of which no frame is selected
         flags = None if self.flags is None else self.flags.of(rows)
         return FrameTable(**own, part_starts=starts, pass_ends=ends, flags=flags)
 
     @staticmethod
     def concat(tables: Sequence[FrameTable]) -> FrameTable:
-        """The frames of all tables, one after another; each is one part or more. Numbers of files are dropped."""
+        """The frames of all tables, one after the other. Each table is one or several parts. Numbers of files are
+        dropped.
+        """
         if len(tables) == 1:
             return tables[0]
         sizes = [len(table) for table in tables]
@@ -201,7 +205,8 @@ class FrameTable:
         columns: dict[str, Any] = {name: _joined([getattr(table, name) for table in tables], sizes) for name in _ARRAYS}
         for name in ("part_starts", "pass_ends"):
             columns[name] = np.concatenate([getattr(table, name) + n for table, n in zip(tables, before, strict=True)])
-        columns["part_starts"] = np.unique(columns["part_starts"])  # an empty part begins with the next
+        # an empty part would begin at the same row as the next part
+        columns["part_starts"] = np.unique(columns["part_starts"])
         if (replaces := columns["replaces"]) is not None:
             columns["replaces"] = np.where(replaces < 0, -1, replaces + np.repeat(before, sizes))
         flags = FrameFlags.joined([table.flags for table in tables], sizes)
@@ -209,8 +214,11 @@ class FrameTable:
 
 
 def kinds_of(image_keys: NDArray[np.integer[Any]]) -> NDArray[np.int32]:
-    """Kinds of frames [frame] from NXtomo's image keys, or this program's finer ones; undefined codes are INVALID."""
-    known = [kind for kind in FrameKind if kind is not FrameKind.OFFSET_VIEW]  # files tell it by a translation
+    """Kinds of frames [frame] from the image keys of NXtomo, or from the codes of this program, which distinguish more
+    kinds. Undefined codes become INVALID.
+    """
+    # files mark an offset projection by the translation of the sample
+    known = [kind for kind in FrameKind if kind is not FrameKind.OFFSET_VIEW]
     return np.where(np.isin(image_keys, known), image_keys, FrameKind.INVALID).astype(np.int32)
 
 
@@ -218,7 +226,9 @@ _ARRAYS = [each.name for each in fields(FrameTable) if each.name not in ("part_s
 
 
 def _joined(each: Sequence[NDArray[Any] | None], sizes: Sequence[int]) -> NDArray[Any] | None:
-    """Values [frame, ...] of several tables, NaN (-1 of whole numbers) where one states none; None if none does."""
+    """The values [frame, ...] of a column in several tables. A table without the column gives NaN, or -1 for integers.
+    None if no table has the column.
+    """
     known = next((values for values in each if values is not None), None)
     if known is None:
         return None

@@ -1,4 +1,6 @@
-"""Opens and writes HDF5 files, also growing, locked or damaged ones, and explains why a file cannot be read."""
+"""Opens and writes HDF5 files, including files that are growing, locked or damaged. Explains why a file cannot be
+read.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,7 @@ from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import Superblock, superblock
 from beamline.storage.writer_lock import QUIET, WITHOUT, LockFailure, abandoned, lock_failure, opened_whole
 
-COMMITTED = "/entry/progress/frames_committed"  # of this program's own files
+COMMITTED = "/entry/progress/frames_committed"  # path in the files of this program
 
 
 class NotReadyError(DataError):
@@ -46,8 +48,9 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     file, and would write to it when it closes. Two readers that follow the same file would both get wrong values.
     Therefore such a file is opened with a separate handle.
 
-    Raises DataError if it is not a readable HDF5 file, or refers to a path that is not a file (see storage.structure).
-    NotReadyError: it may become one (`follow`).
+    Raises DataError if the path is not a readable HDF5 file, or if the file refers to a path that is not a file (see
+    storage.structure).
+    Raises NotReadyError with `follow` if the file may become readable.
     """
     if not path.is_file():
         raise (NotReadyError if follow else DataError)(no_file(path))
@@ -72,10 +75,10 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
 
 def _ways(head: Superblock | None, follow: bool) -> list[tuple[bool, bool | None]]:
     """Ways to open a file, (swmr, locking), in the order in which they are tried."""
-    # A follower takes no lock, so as not to be taken for a writer.
+    # A reader that follows the file takes no lock, because it would otherwise look like a writer.
     growing, whole, shared = (True, False), (False, None), (True, None)
     ways: list[tuple[bool, bool | None]] = [growing, whole, shared] if follow else [whole, growing, shared]
-    # HDF5 would wait for ever for a writer that repairs what is missing or damaged
+    # HDF5 would wait for ever for a writer to complete what is missing or damaged
     waits = head is None or head.missing or not (follow or head.open_for_writing)
     return [way for way in ways if not (way[0] and waits)]
 
@@ -83,7 +86,7 @@ def _ways(head: Superblock | None, follow: bool) -> list[tuple[bool, bool | None
 def _unopened(
     path: Path, follow: bool, head: Superblock | None, problems: list[OSError | RuntimeError | ValueError]
 ) -> DataError:
-    """Why none of the ways opened a file."""
+    """The error that says why the file could not be opened in any of these ways."""
     if follow:
         return NotReadyError(f"{path} cannot be followed yet ({problems[0]}).")
     cut = re.search(r"truncated file: eof = (\d+),.* stored_eof = (\d+)", str(problems[0]))
@@ -110,10 +113,10 @@ def _unopened(
 
 
 def grows_here(path: Path) -> bool:
-    """True if this program has the file open through HDF5's own driver, for writing or following it."""
+    """True if this program has the file open with HDF5's own driver, to write it or to follow it."""
     here = path.stat()
     for file in h5py.h5f.get_obj_ids(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE):
-        with suppress(OSError, RuntimeError, ValueError):  # another thread just closed it
+        with suppress(OSError, RuntimeError, ValueError):  # another thread has just closed the file
             by_name = file.get_access_plist().get_driver() != h5py.h5fd.fileobj_driver
             writes = by_name and file.get_intent() != h5py.h5f.ACC_RDONLY
             if writes and os.path.samestat(here, Path(os.fsdecode(file.name)).stat()):
@@ -122,8 +125,8 @@ def grows_here(path: Path) -> bool:
 
 
 def _apart(path: Path, head: Superblock | None, follow: bool) -> h5py.File:
-    """A file that this program writes, or whose process was killed, opened by a driver that shares it with no other
-    handle of HDF5.
+    """Open a file that this program is writing, or whose process was killed. The driver used here shares no data with
+    other HDF5 handles of the file.
     """
     if head is None or (head.open_for_writing and not head.grows and not abandoned(path)):
         raise (NotReadyError if follow else DataError)(f"This program is still creating {path}. Try again.")
@@ -147,8 +150,8 @@ def look_again(item: h5py.Dataset) -> None:
 def n_written(item: Any) -> int:
     """Number of frames or values of a growing dataset that are already written.
 
-    Its writer may have allocated more: frames of which no chunk is stored yet, or values at the end of a list that are
-    its fill value or NaN.
+    The writer may have allocated more: frames without a stored chunk, or values at the end of a list that are still the
+    fill value or NaN.
     """
     look_again(getattr(item, "item", item))
     if item.ndim == 1:
@@ -180,8 +183,9 @@ ALTERED = (
     *(OSError, RuntimeError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError, AssertionError),
     *(EOFError, MemoryError, struct.error, zlib.error, zipfile.BadZipFile),
 )
-"""What libraries raise where a file is damaged, or holds other things than its names promise; none of ours is among
-them."""
+"""Errors that libraries raise if a file is damaged, or contains something else than its names say. Errors of this
+program are not among them.
+"""
 
 
 @contextmanager
@@ -217,14 +221,15 @@ def guarded(method: Callable[[_S], _T]) -> Callable[[_S], _T]:
     return read
 
 
-_CONTENT = r"array|bytes|unsized|'(Dataset|Datatype|Empty|Group|str)'"  # of a TypeError by what a file holds
+_CONTENT = r"array|bytes|unsized|'(Dataset|Datatype|Empty|Group|str)'"  # the content of a file can cause a TypeError
 
 
 def _of_our_own(error: Exception) -> bool:
-    """True if a programming error in a reader raised it, and not a library that found something unexpected.
+    """True if the error is a programming error in a reader. False if a library raised it because the file contains
+    something unexpected.
 
-    If a dataset is where a group was expected, the group's attributes are missing: then the object is the file's, and
-    the error counts as one of the file.
+    If a file has a dataset instead of the expected group, the methods of a group are missing. The object that lacks
+    them then belongs to the file, so the error is not a programming error.
     """
     content = isinstance(
         getattr(error, "obj", None), h5py.HLObject | h5py.Empty | np.ndarray | np.generic | str | bytes
@@ -246,7 +251,7 @@ def closed_on_error(file: Any) -> Iterator[None]:
 
 
 def reason(error: Exception) -> str:
-    """The reason that the disk or the system gives, in its own words, without HDF5's addresses and offsets."""
+    """The reason in the words of the disk or the operating system, without the addresses and offsets that HDF5 adds."""
     message = re.search(r"error message = '([^']*)'", str(error))
     return message[1] if message else (isinstance(error, OSError) and error.strerror) or str(error)
 
@@ -257,20 +262,22 @@ class NewFile(h5py.File):  # type: ignore[misc]  # h5py has no types
     def __init__(self, disk: DiskFile, mode: str, libver: str | tuple[str, str] | None = None) -> None:
         super().__init__(disk, mode, libver=libver)
         self.require_taken = disk.require_taken
-        """Raises OSError if the disk did not take something; call it now and then during long writes."""
+        """Raises OSError if a write to the disk failed. Call it from time to time during long writes."""
 
 
 def created(path: Path, libver: str | tuple[str, str] | None = None) -> AbstractContextManager[NewFile]:
     """Create a file. At the end of the block it is flushed to the disk.
 
     Raises:
-        OSError: the disk failed; the file is closed and stays.
+        OSError: the disk failed; the file is closed and not deleted.
     """
     return _written(path, "x", libver)
 
 
 def changed(path: Path, libver: str | tuple[str, str] | None = None) -> AbstractContextManager[NewFile]:
-    """Open an existing file to change it, as `created` does; a disk error leaves the changes half done."""
+    """Open an existing file to change it. Errors are raised as by `created`. After a disk error, only a part of the
+    changes may be in the file.
+    """
     return _written(path, "r+", libver)
 
 
@@ -282,8 +289,8 @@ def _written(path: Path, mode: Literal["x", "r+"], libver: str | tuple[str, str]
                 yield file
             disk.finish()
         except Exception as error:
-            disk.require_taken()  # the cause, where the disk is
-            if isinstance(error, OSError | RuntimeError):  # h5py's classes for HDF5's errors
+            disk.require_taken()  # the cause, if the disk is the cause
+            if isinstance(error, OSError | RuntimeError):  # names of h5py's classes for errors of HDF5
                 number = error.errno if isinstance(error, OSError) and error.errno else errno.EIO
                 raise OSError(number, reason(error), str(path)) from error
             raise

@@ -40,7 +40,7 @@ def scan_file(path: str | Path) -> Path:
     """The scan file at a path: the file itself, or for the folder of a run the file with all its parts.
 
     Raises:
-        DataError: a run without a scan file, one whose parts are not joined, or a folder of runs.
+        DataError: the path is a run without a scan file, a run whose parts are not joined, or a folder of several runs.
     """
     path = Path(path)
     if not path.is_dir():
@@ -56,10 +56,10 @@ def scan_file(path: str | Path) -> Path:
 
 
 def whole_scan(path: Path) -> Path:
-    """The scan file that a path stands for, with links resolved. A run's folder, or any part of a resumed run, stands
-    for the file that joins all parts.
+    """The scan file of a path, with links resolved. For the folder of a run, or for any part of a resumed run, it is
+    the file that joins all parts.
 
-    A path at which there is no scan is returned as it is: opening it raises the error that says why.
+    If there is no scan at the path, the path itself is returned. Opening it then raises an error with the reason.
     """
     with suppress(DataError, RuntimeError):  # RuntimeError: links in a circle
         joined = None if path.is_dir() else joined_file_of(path)
@@ -71,7 +71,7 @@ def volume_file(path: Path) -> Path:
     """The volume file at a path: the file or folder itself, or for the folder of a run its recon.h5.
 
     Raises:
-        DataError: a run without a volume, or a folder of runs.
+        DataError: the path is a run without a volume, or a folder of several runs.
     """
     if (path / RECON).is_file():
         return path / RECON
@@ -83,7 +83,7 @@ def volume_file(path: Path) -> Path:
 
 
 def _no_run(folder: Path, wanted: str) -> Path:
-    """The folder itself, which may contain slices for example. Raises DataError if it is the folder of a run, or of
+    """The folder itself, which may contain slices. Raises DataError if the folder is that of a run, or contains several
     runs.
     """
     if (folder / EVENTS).is_file():
@@ -102,7 +102,8 @@ def next_step(scan: Path) -> str:
     if not scan.is_file() or not marked_as_being_written(scan):
         return ""
     with suppress(DataError, *hdf5.ALTERED), hdf5.open_hdf5(scan) as file:
-        if layout.COMMITTED not in file:  # another program writes it, which has no lock that shows whether it lives
+        # if another program writes the file, no lock shows whether that program is alive
+        if layout.COMMITTED not in file:
             return (
                 f"It is marked as being written, but has not changed for {QUIET:.0f} s or longer. If the "
                 f"program that wrote it has ended, `h5clear -s {scan}` clears the mark."
@@ -161,7 +162,7 @@ def _died(sure: bool) -> str:
 
 
 def _lacks_views(run: Path) -> bool:
-    """True if projections are missing in the files of a run, which are all closed; offset projections included."""
+    """True if projections, or offset projections, are missing in the files of a run. All files must be closed."""
     with suppress(DataError, *hdf5.ALTERED), ExitStack() as opened:
         files = [opened.enter_context(hdf5.open_hdf5(part)) for part in files_with_frames(run)]
         return bool(still_to_take(files)[0]) or offset_planned(files[0]) > len(offset_taken(files))
@@ -169,16 +170,17 @@ def _lacks_views(run: Path) -> bool:
 
 
 def still_to_take(files: Sequence[h5py.File]) -> tuple[frozenset[int], tuple[str, ...], bool]:
-    """Projections that a scan still has to take, from its plan and its decisions; none for a file without its plan.
+    """The projections that a scan still has to take, from its plan and the decisions after its passes. A file without a
+    plan gives no projections.
 
     Args:
-        files: all files of the scan, in the order in which they were taken, or the one that joins them.
+        files: all files of the scan, in the order of acquisition, or the file that joins them.
 
     Returns:
-        The triggers of these projections, counted from 0: without those that the scan decided to omit, but with those
-            of a pass that it was taking again. What it chose after each pass that ended, `Choice.NEXT` if the files do
-            not state it. True if a choice is due: the last pass has ended, and neither a choice nor a projection
-            follows.
+        Three values. (1) The triggers of these projections, counted from 0. Projections that the scan decided to omit
+        are not included; projections of a pass that is being repeated are. (2) The choice after each pass that has
+        ended; `Choice.NEXT` if the files do not state it. (3) True if a choice is due, because the last pass has ended
+        and neither a choice nor a projection follows.
     """
     views, since_pass_end, chosen, n_ended = set[int](), set[int](), dict[str, str](), 0
     for file in files:
@@ -199,7 +201,7 @@ def still_to_take(files: Sequence[h5py.File]) -> tuple[frozenset[int], tuple[str
 
 
 def n_still_to_take(file: h5py.File) -> int | None:
-    """Number of projections in `still_to_take` for a file; None: not known, because the record of its choices is
+    """Number of projections that `still_to_take` returns for a file. None if the choices stored in the file are
     damaged.
     """
     with suppress(*hdf5.ALTERED):
@@ -213,12 +215,13 @@ def offset_taken(files: Sequence[h5py.File]) -> frozenset[int]:
 
 
 def _passes_of(file: h5py.File, choices: Iterable[str]) -> Passes:
-    """The passes of a plan as a file holds it, after these choices. How many projections a pass of a step scan has, its
-    configuration says."""
+    """The passes of the plan in a file, after these choices. The configuration in the file states how many projections
+    a pass of a step scan has.
+    """
     plan, config = plan_in(file), file["/entry/record/config"].asstr()[()]
     angles, stated = np.radians(plan["angles_deg"]), re.search(r"^  pass_views: (\d+)", config, re.MULTILINE)
     steps = np.diff(angles)
-    turns = np.flatnonzero(steps * steps[:1] < 0)  # where a fly scan begins its next sweep
+    turns = np.flatnonzero(steps * steps[:1] < 0)  # first projections of the next sweeps of a fly scan
     sweep = int(turns[0]) + 1 if turns.size else 0
     pass_views = int(stated[1]) if stated else 0
     size = pass_views * plan.get("frames_per_view", 1) if plan.get("mode") == Mode.STEP else sweep

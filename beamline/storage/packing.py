@@ -34,9 +34,11 @@ class PackedDataset(h5py.Dataset):  # type: ignore[misc]  # h5py has no types
 
 
 def unpacked(item: h5py.Dataset) -> h5py.Dataset:
-    """The dataset, unpacked on reading if its numbers are packed. Raises DataError as `packing`."""
+    """The dataset. If its numbers are packed, they are unpacked when they are read. Raises DataError as `packing`
+    does.
+    """
     if not isinstance(item, h5py.Dataset) or item.dtype.kind not in "uif" or not _NAMES & {*item.attrs}:
-        return item  # an array of a Zarr has done so
+        return item  # an array of a Zarr already unpacks its numbers
     by_cil = "cil_version" in item.file.attrs or "NEXUSDataWriter" in str(item.file.attrs.get("creator"))
     values = packing(item.attrs, item.dtype, f"{item.name} in {item.file.filename}", by_cil=by_cil)
     return item if values is None else PackedDataset(item, values)
@@ -45,20 +47,20 @@ def unpacked(item: h5py.Dataset) -> h5py.Dataset:
 def packing(
     attributes: Mapping[str, Any], dtype: np.dtype[Any], where: str, *, by_cil: bool
 ) -> Callable[[Any], NDArray[Any]] | None:
-    """A function that converts stored numbers [...] to values, with NaN for numbers that mark missing values; None if
-    the stored numbers are the values.
+    """A function that converts stored numbers [...] to values. Numbers that mark missing values become NaN. None if the
+    stored numbers are the values.
 
     The values have a real type that can represent all stored numbers. They are stored * scale_factor + add_offset in CF
     files, and (stored - offset) / scale in CIL files.
 
     Args:
-        attributes: of the numbers.
-        dtype: of the stored numbers.
-        where: names them in an error.
-        by_cil: True if CIL wrote the file, because other programs use scale and offset with another meaning.
+        attributes: attributes of the dataset.
+        dtype: type of the stored numbers.
+        where: name of the dataset in an error message.
+        by_cil: True if CIL wrote the file. Other programs use the names `scale` and `offset` with another meaning.
 
     Raises:
-        DataError: the meaning of the attributes is unknown, or they give no finite value.
+        DataError: the meaning of the attributes is unknown, or they do not give finite values.
     """
     real = np.result_type(dtype, np.float32)
     pair = _CIL if dtype.kind in "ui" and {*_CIL} <= {*attributes} and not {*_CF} & {*attributes} else _CF
@@ -79,20 +81,22 @@ def packing(
     signed = np.dtype(dtype.str.replace("i", "u")) if unsigned else dtype
     fills = np.concatenate([np.ravel(attributes.get(name, [])) for name in ("_FillValue", "missing_value")])
     ends = (-np.inf, np.inf) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
-    fills = fills[(fills >= ends[0]) & (fills <= ends[1])].astype(dtype).view(signed)  # NaN are no values as they are
+    # a NaN is already a missing value
+    fills = fills[(fills >= ends[0]) & (fills <= ends[1])].astype(dtype).view(signed)
     limits = np.ravel(
         attributes.get("valid_range", [attributes.get("valid_min", -np.inf), attributes.get("valid_max", np.inf)])
     )
-    if limits.dtype.kind == "f" and dtype.kind != "f":  # in the unit of the values, as these have another type
+    # these numbers are in the unit of the values, because their type differs from the stored type
+    if limits.dtype.kind == "f" and dtype.kind != "f":
         limits = np.rint((limits - offset) / scale)
     low, high = limits.min(), limits.max()
     if (scale, offset, signed, fills.size) == (1, 0, dtype, 0) and low <= ends[0] and ends[1] <= high:
         return None
 
     def values(stored: Any) -> NDArray[Any]:
-        numbers = np.asarray(stored, dtype).view(signed)  # a single number comes in the order of this machine
-        made = np.asarray(numbers.astype(real) * scale + offset, real)
-        made[np.isin(numbers, fills) | (numbers < low) | (numbers > high)] = np.nan
-        return made
+        numbers = np.asarray(stored, dtype).view(signed)  # a single number has the byte order of this machine
+        real_values = np.asarray(numbers.astype(real) * scale + offset, real)
+        real_values[np.isin(numbers, fills) | (numbers < low) | (numbers > high)] = np.nan
+        return real_values
 
     return values

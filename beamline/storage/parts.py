@@ -1,8 +1,9 @@
-"""Parts: a resumed scan has several files. Finds which projections each contains, and joins them in one file.
+"""Parts: a resumed scan has several files. Finds which projections each file contains, and joins the files in one file.
 
 The joined file is an NXtomo of this program whose pixels are virtual (HDF5 virtual datasets, as in the /exchange
-view). It contains no frame itself, so it can be made again at any time. The files with the frames are never
-written again. It records name and number of frames of each part, so that a reader can check that it has all parts.
+view). The joined file contains no frame itself, so it can be made again at any time. The files with the frames are
+never changed. The joined file records the name and the number of frames of each part, so that a reader can check that
+no part is missing.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def views_planned(file: h5py.File) -> int | None:
 def offset_planned(file: h5py.File) -> int:
     """Number of planned offset projections of the scan."""
     plan = plan_in(file)
-    kind = "wide" if "wide_views" in plan else "offset"  # the name in files of earlier versions
+    kind = "wide" if "wide_views" in plan else "offset"  # name in the files of earlier versions
     return int(plan.get(f"{kind}_views", 0)) * len(plan.get(f"{kind}_places_mm", ()))
 
 
@@ -59,10 +60,11 @@ def plan_in(file: h5py.File) -> dict[str, Any]:
 
 
 def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
-    """Triggers without a frame before the last projection, found from the frames themselves: for files whose process
-    was killed.
+    """Triggers before the last projection that have no frame, found from the frames of the file. This is for files
+    whose process was killed.
 
-    None for a later part of a run, which takes what is missing in the parts before, and for files without their plan.
+    None for a file without a plan, and for a later part of a run, because a later part takes the projections that are
+    missing in the earlier parts.
     """
     table = frames_in(file)
     views = table.views
@@ -71,25 +73,27 @@ def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
     references = table.of_kind(FrameKind.DARK, FrameKind.FLAT)
     first = references[references < views[0]].max(initial=-1) + 1
     seen = table.triggers[first : views[-1] + 1]
-    seen = seen[seen < (views_planned(file) or 0)]  # offset projections, and those taken again, count on from there
+    # triggers of offset projections, and of projections taken again, have higher numbers
+    seen = seen[seen < (views_planned(file) or 0)]
     gaps = np.setdiff1d(np.arange(seen.max(initial=0)), seen)
     return tuple((sum(_planned(file, "start").values()) + gaps).tolist())
 
 
 def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
-    """Kinds of darks and flats planned after the projections that are missing, completely or in part, in the files of a
-    scan.
+    """The kinds of frames (darks, flats) that are planned after the projections, and that are completely or partly
+    missing in the files of a scan.
 
     Args:
-        files: all files of the scan, in the order in which they were taken.
+        files: all files of the scan, in the order of acquisition.
     """
     taken = _after_views(files)
     return frozenset(kind for kind, n in _planned(files[0], "end").items() if len(taken[kind]) < n)
 
 
 def _planned(file: h5py.File, when: str) -> dict[FrameKind, int]:
-    """Numbers of references planned at the "start" or the "end" of the projections, in the order of acquisition at the
-    end."""
+    """Planned numbers of darks and of flats at the "start" or at the "end" of the projections, in the order of
+    acquisition at the end.
+    """
     plan = plan_in(file)
     fields = {FrameKind.FLAT: plan.get("flats", {}), FrameKind.DARK: plan.get("darks", {})}
     return {kind: int(field["count"]) for kind, field in fields.items() if field.get("at") in (when, "both")}
@@ -104,15 +108,16 @@ def _after_views(files: Sequence[h5py.File]) -> dict[FrameKind, set[int]]:
 
 
 def join(parts: Sequence[Path], joined: Path) -> int:
-    """Create or replace the file with the frames of all parts, in this order; returns their number.
+    """Create or replace the file that joins the frames of all parts, in this order. Returns the number of frames.
 
     Args:
-        parts: closed files of one scan, each with a frame at least. They are only read.
+        parts: closed files of one scan, each with at least one frame. They are only read.
 
     Raises:
-        DataError: a part cannot be read or was not closed, or the disk does not take the file; the old file then stays.
+        DataError: a part cannot be read or was not closed, or the disk failed. An existing joined file is then
+            unchanged.
     """
-    for part in parts:  # HDF5 draws nothing from a file that is marked as being written
+    for part in parts:  # HDF5 reads nothing through a virtual dataset from a file that is marked as being written
         if (head := superblock(part)) is not None and head.open_for_writing:
             raise DataError(
                 f"{joined} could not be made, because the file {part} was not closed. The parts were not changed."
@@ -130,18 +135,19 @@ def join(parts: Sequence[Path], joined: Path) -> int:
 
 
 def other_parts(part: Path) -> list[Path]:
-    """The files of the other parts of its run that may hold frames, joined or not."""
+    """The files of the other parts of the same run that may contain frames, whether they are joined or not."""
     part = part.resolve()
     return [file for file in files_with_frames(run_of(part.parent), part.name) if not same_file(file, part)]
 
 
 def files_with_frames(run: Path, name: str = SCAN) -> list[Path]:
-    """The files of this name in the folders of a run's parts that may hold frames."""
+    """The files with this name in the folders of the parts of a run that may contain frames."""
     return [folder / name for folder in parts_of(run) if may_hold_frames(folder / name)]
 
 
 def may_hold_frames(part: Path) -> bool:
-    """True if a part may have frames: its file has one, or its log of events (perhaps incomplete) names one.
+    """True if a part may have frames: its file contains a frame, or its event log, which may be incomplete, mentions
+    one.
 
     A part that ended before its first frame does not count.
     """
@@ -156,9 +162,11 @@ def may_hold_frames(part: Path) -> bool:
 
 
 def joined_file_of(part: Path) -> tuple[Path, int] | None:
-    """The file that joins this one with other parts of its scan, and how many it joins; None if there is none."""
+    """The file that joins this file with the other parts of the scan, and the number of joined parts. None if no file
+    joins them.
+    """
     part = part.resolve()
-    for folder in (part.parent, part.parent.parent):  # that of the run, or of a later part in it
+    for folder in (part.parent, part.parent.parent):  # the joined file of the run, or the joined file in a later part
         with suppress(DataError, *hdf5.ALTERED), hdf5.open_hdf5(folder / JOINED) as file:
             names = [source.file_name for source in file[layout.DATA].virtual_sources()]
             if any(same_file(folder / name, part) for name in names):
@@ -167,14 +175,14 @@ def joined_file_of(part: Path) -> tuple[Path, int] | None:
 
 
 def to_join(run: Path) -> str:
-    """The command that joins the parts of a run, as the end of a sentence."""
+    """The end of a sentence that names the command that joins the parts of a run."""
     return f"`beamline recover {run}` joins the existing parts"
 
 
 def require_joined(file: h5py.File) -> None:
-    """Raise DataError if a joined file refers to frames of changed parts, or if a part is missing.
+    """Raise DataError if a part to which a joined file refers has changed or is missing.
 
-    A file with frames of its own, such as a repacked copy, always passes.
+    A file that contains the frames itself, such as a repacked copy, always passes.
     """
     if layout.PART_STARTS not in file or not file[layout.DATA].is_virtual:
         return
@@ -187,7 +195,7 @@ def require_joined(file: h5py.File) -> None:
 
 
 def is_joined(joined: Path) -> bool:
-    """True if this file exists and has the frames of all parts of its scan."""
+    """True if this file exists and joins the frames of all parts of its scan."""
     with suppress(DataError), hdf5.open_hdf5(joined) as file, hdf5.readable(joined):
         require_joined(file)
         return True
@@ -246,20 +254,20 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
 
 
 def copy_rows(file: h5py.File, n: int, target: hdf5.NewFile) -> tuple[int, ...]:
-    """Copy the first `n` rows of a scan file, with all that is not stored by row, into a new, closed file.
+    """Copy the first `n` rows of a scan file, and everything that is not stored by rows, to a new, closed file.
 
     Returns:
-        the rows whose pixels differ from their checksum; those that cannot be read become zeros.
+        the rows whose pixels differ from their checksum. Pixels that cannot be read become zeros.
     """
     _copy(file["/"], target, {path: file[path][:n] for path in layout.growing(file)})
     for path in _VIRTUAL:
         item = file[path]
         maxshape, chunks = (None, *item.shape[1:]), (1, *item.shape[1:])
-        made = target.create_dataset(path, (n, *item.shape[1:]), item.dtype, chunks=chunks, maxshape=maxshape)
-        datasets.copy_attributes(item, made)
+        copy = target.create_dataset(path, (n, *item.shape[1:]), item.dtype, chunks=chunks, maxshape=maxshape)
+        datasets.copy_attributes(item, copy)
         for row in range(n):
             with suppress(*hdf5.ALTERED):
-                made[row] = item[row]
+                copy[row] = item[row]
             target.require_taken()
     _complete(file, target, n)
     return tuple(row for row in range(n) if not is_whole(target, row))
@@ -273,7 +281,7 @@ def is_whole(file: h5py.File, row: int) -> bool:
 
 
 def _complete(source: h5py.File, target: h5py.File, n: int) -> None:
-    """The links of the source, and what a writer adds at the end of its `n` frames."""
+    """Add the links of the source file, and the entries that a writer adds after the last of `n` frames."""
     for name, item in source["/entry/data"].items():
         if linked := datasets.attribute(item, "target"):
             target[f"/entry/data/{name}"] = target[linked]
@@ -284,7 +292,9 @@ def _complete(source: h5py.File, target: h5py.File, n: int) -> None:
 
 
 def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]]) -> None:
-    """Copy a group, with these values for the named datasets; without virtual datasets, new ones, and links."""
+    """Copy a group. The named datasets get these values. Virtual datasets, datasets made anew, and links are not
+    copied.
+    """
     datasets.copy_attributes(source, target)
     for name in source:
         path = f"{source.name.rstrip('/')}/{name}"
@@ -303,7 +313,7 @@ def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]
 
 
 def _missing(files: Sequence[h5py.File]) -> tuple[int, ...]:
-    """Triggers that gave no frame, in a later part either."""
+    """Triggers that gave no frame, neither in this part nor in a later part."""
     before = sum(_planned(files[0], "start").values())
     stored = {before + view for file in files for view in frames_in(file).numbers_taken()}
     taken, first = _after_views(files), before + (views_planned(files[0]) or 0)

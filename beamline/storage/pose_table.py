@@ -27,7 +27,7 @@ from recon.base.arrays import F64
 from recon.base.vectors import geometry_of_vectors
 
 Key = Literal["frame", "view", "angle_deg"]
-IGNORE = "ignore"  # In place of a file: projections count as not displaced, whatever their scan file says
+IGNORE = "ignore"  # value in place of a file: all projections count as not displaced, whatever the scan file says
 _KEYS: tuple[Key, ...] = "frame", "view", "angle_deg"
 _PIXELS = "shift_col_px", "shift_row_px"
 _TURNS = "roll_deg", "tilt_deg"
@@ -36,9 +36,10 @@ _VECTORS = {
     cone: tuple(f"{vector}_{axis}" for vector in (first, "d", "u", "v") for axis in "xyz")
     for cone, first in ((False, "ray"), (True, "src"))
 }
-_ARRAYS = {"parallel3d_vec": False, "cone_vec": True}  # arrays of vectors, and whether they are of a cone
-_STEEPEST = 85.0  # degrees of tilt
-_LARGEST = 64 * 2**20  # bytes of a CSV
+# names of arrays of vectors, and whether the vectors are those of a cone beam
+_ARRAYS = {"parallel3d_vec": False, "cone_vec": True}
+_STEEPEST = 85.0  # smallest tilt in degrees with which a row shows several slices
+_LARGEST = 64 * 2**20  # largest size of a CSV in bytes
 _HOW = (
     "state the directions: --poses FILE:x,-y means that a positive x_translation shifts the sample towards higher "
     "columns, and a positive y_translation towards lower rows"
@@ -50,10 +51,11 @@ class PoseTable:
     """Poses of some projections, in unbinned pixels.
 
     Attributes:
-        path: of the file.
+        path: path of the file.
         by: meaning of `keys`: rows of the scan file, projections counted from 0 in its order, or angles in degrees.
         keys: float64 [row], all different.
-        angles_deg: float64 [row] of the projections, to be compared with the scan's; None if the file has none.
+        angles_deg: float64 [row], angles of the projections, to be compared with the angles of the scan. None if the
+            file has no angles.
         shifts: float64 [row, 2], displacement of the image along (columns, rows), in `unit`.
         turns_deg: float64 [row, 2], roll and tilt, as in `recon.base.geometry.Geometry`.
         unit: "px" of the unbinned detector, or "mm" at the sample.
@@ -62,7 +64,7 @@ class PoseTable:
             not known.
         vectors: float64 [row, 12] in mm, as in `recon.base.vectors`, which state the complete geometry; None: no
             vectors.
-        cone: the vectors are of a cone beam.
+        cone: True if the vectors are those of a cone beam.
     """
 
     path: Path
@@ -79,7 +81,7 @@ class PoseTable:
 
     @property
     def leans(self) -> bool:
-        """True if a row of a projection may show several slices, because the projection is rolled or tilted."""
+        """True if a detector row may show several slices, because a projection is rolled or tilted."""
         return self.vectors is not None or bool(self.turns_deg.any())
 
     def __str__(self) -> str:
@@ -104,11 +106,13 @@ class PoseTable:
 
 
 class _NoPosesError(Exception):
-    """A valid file that does not state poses: a ValueError would be mistaken for damage."""
+    """A valid file that does not state poses. It is not a ValueError, because a ValueError would be taken for a damaged
+    file.
+    """
 
 
 def read_poses(text: str) -> PoseTable:
-    """The table named by `FILE`, or `FILE:x,-y` of an NXtomo file; an empty one for `ignore`.
+    """The table that a text names: `FILE`, or `FILE:x,-y` for an NXtomo file. The text `ignore` gives an empty table.
 
     Raises:
         ValueError: the file cannot be read as poses; the message says why.
@@ -154,7 +158,9 @@ def _of_csv(path: Path, content: str) -> PoseTable:
 
 
 def _require_header(path: Path, names: list[str], cone: bool | None) -> None:
-    """ValueError for a first line without a key and poses, or all vectors (of a cone or not), or with other names."""
+    """Raise ValueError unless the first line contains a key, and either poses or a complete set of vectors (of a
+    parallel beam or a cone), and no other names.
+    """
     stated = (*_PIXELS, *_TURNS) if cone is None else _VECTORS[cone]
     missing = set(stated) - set(names)
     if not set(names) & set(_KEYS) or (len(missing) == len(stated) if cone is None else missing):
@@ -169,7 +175,7 @@ def _require_header(path: Path, names: list[str], cone: bool | None) -> None:
 
 
 def _numbers(path: Path, names: list[str], rows: list[list[str]]) -> F64:
-    """The table [row, column]; ValueError for cells that are no numbers, and without a row."""
+    """The table [row, column]. Raises ValueError if a cell is not a number, or if there is no row."""
     if not rows:
         raise ValueError(f"{path} has a header and no rows; expected one row for each projection")
     values = np.empty((len(rows), len(names)))
@@ -182,7 +188,7 @@ def _numbers(path: Path, names: list[str], rows: list[list[str]]) -> F64:
 
 
 def _require_keys(path: Path, columns: dict[str, F64], by: Key) -> None:
-    """ValueError for keys that are no whole numbers from 0 on, or angles that are not finite."""
+    """Raise ValueError for keys that are not integers of at least 0, and for angles that are not finite."""
     for name in {by, "angle_deg"} & columns.keys():
         given = columns[name]
         bad = ~np.isfinite(given) | ((name != "angle_deg") & (given != np.abs(np.round(given))))
@@ -192,7 +198,7 @@ def _require_keys(path: Path, columns: dict[str, F64], by: Key) -> None:
 
 
 def _of_arrays(path: Path) -> PoseTable:
-    """Vectors of all projections, in an .npz under the name that ASTRA has for their kind."""
+    """The vectors of all projections. An .npz contains them under the name that ASTRA uses for their kind."""
     with hdf5.readable(path):
         arrays = numpy_arrays(path)
     read = {name: values for name, values in arrays.items() if name in _ARRAYS}
@@ -241,15 +247,15 @@ def _of_volume(path: Path, record: ReconRecord) -> PoseTable:
 
 
 CENTRES_KEPT = "view_centres_mm"
-"""Parameter of a volume: `Geometry.centres` of its views."""
+"""Name of a parameter in a volume file: `Geometry.centres` of the projections."""
 
 POSES_KEPT = "view_shifts_px", "view_roll_deg", "view_tilt_deg"
-"""Parameters of a volume that keep the poses of its views, shifts in binned pixels."""
+"""Names of the parameters in a volume file that contain the poses of the projections. Shifts are in binned pixels."""
 
 
 def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> PoseTable:
-    """Translations of the sample, in mm from their median, because a common translation is not a displacement of a
-    projection.
+    """Translations of the sample in mm, minus their median. A translation that all projections share does not displace
+    a projection relative to the others.
     """
     places = choose(file, find(file))
     kinds = places.kinds()
@@ -295,11 +301,11 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
 
 
 def write_poses(path: Path, volume: Path) -> tuple[int, float]:
-    """Write the poses of the projections of a volume file as a CSV that `read_poses` reads; returns the number of
-    projections, and the axis' column.
+    """Write the poses of the projections of a volume file as a CSV that `read_poses` reads; Returns the number of
+    projections, and the column of the rotation axis.
 
     Raises:
-        DataError: the volume holds none, `path` exists, or the disk refuses; nothing is left.
+        DataError: the volume file contains no poses, `path` exists, or the disk failed. No new file is left.
     """
     with opened_reconstruction(volume) as record:
         try:

@@ -1,4 +1,4 @@
-"""ReconRecord: the facts about a volume, identical in its file, in the event `done` and in scripts."""
+"""ReconRecord: all facts about a volume. They are the same in its file, in the event `done` and in scripts."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ from recon.base.volume import Grid, Volume, VolumeSeries
 
 Value = str | int | float | bool | NDArray[Any]
 _ENDS = {"ended_early": "early", "resumed_from": "resumed_from", "checkpoint_lost": "lost_checkpoint"}
-"""Parameters that tell how it ended, and fields of `Ending`."""
+"""Names of the parameters that state how a reconstruction ended, and of the fields of `Ending`."""
 
 
 @dataclass(frozen=True, eq=False)
 class VoxelsInFile:
-    """float32 voxels, [z, y, x] or [volume, z, y, x], that are only in files: `read` loads a part when it is needed."""
+    """float32 voxels, [z, y, x] or [volume, z, y, x], that are in files and not in memory. `read` loads a part when it
+    is needed.
+    """
 
     shape: tuple[int, ...]
     read: Callable[[Any], NDArray[np.float32]]
@@ -39,7 +41,7 @@ class VoxelsInFile:
 
 
 class VolumeField:
-    """A field of a dataclass that holds a volume; voxels in a file are read on first use."""
+    """A field of a dataclass for a volume. Voxels in a file are read when the field is first used."""
 
     def __get__(self, record: Any, owner: type | None = None) -> Volume:
         if record is None:
@@ -57,32 +59,33 @@ class VolumeField:
 class ReconRecord:
     """The record of a volume: its method, settings, data, figures of merit and files.
 
-    The same value is in the file of the volume, in the event `done` and in the results of `beamline.api`.
+    The same values are in the file of the volume, in the event `done` and in the results of `beamline.api`.
 
     Attributes:
-        volume: `volume.data` float32 [z, y, x]; of an open file, a dataset that is sliced along z. Of a file just
-            written, it is read at the first use.
+        volume: `volume.data` float32 [z, y, x]. For an open file, it is a dataset that can be sliced along z. For a
+            file that was just written, it is read when it is first used.
         length_unit: "mm" if the pixel size is known, otherwise "px".
         raw_file: name of the scan it was made from.
-        time: s since the Unix epoch when it was made.
+        time: time at which the volume was made, in s since the Unix epoch.
         parameters: every setting used, by name; numbers, strings and arrays.
         metrics: figures of merit, by name.
         history: equally long arrays, by name (step, seconds, loss ...); empty if there are no steps.
-        deviation: float32 [z, y, x], the standard deviation of each voxel in the volume's unit; None: not known.
+        deviation: float32 [z, y, x], standard deviation of each voxel, in the unit of the volume; None: not known.
         series: all volumes, if `volume` is one of several; None: it is the only one.
-        change: float32 [z, y, x], the volume minus a reference that was moved to it; None: no reference was used.
-        displacement: float32 [3, z, y, x] along z, y, x in the unit of lengths: the place in the reference minus that
-            in the volume; None: as `change`.
-        kind: what the voxels are.
+        change: float32 [z, y, x], the volume minus the reference, after the reference was moved to the position of the
+            volume; None: no reference was used.
+        displacement: float32 [3, z, y, x] along z, y, x in `length_unit`: position of a point in the reference minus
+            its position in the volume; None: no reference was used.
+        kind: the quantity of the voxels.
         model: the Gaussians behind the volume and the geometry of their projections (`result.arrays_of_model`); empty:
-            none.
-        compared: metrics of FBP of the same projections; None: not computed. This attribute and the following ones
-            exist only for a volume that was just reconstructed; files do not contain them.
+            there is no model.
+        compared: figures of merit of FBP from the same projections; None: not computed. This attribute and the
+            following ones exist only for a volume that was just reconstructed; files do not contain them.
         warnings: sentences.
-        hiding: the warning that the volume may hide details; empty: no such warning.
-        chosen: how `auto` or a preset came to its settings; empty if they were given.
-        output, report: files of the volume and of its report; None: not written.
-        elapsed, times: seconds in total, and of each phase.
+        hiding: the warning that the volume may hide details; empty: there is no such warning.
+        chosen: how `auto` or a preset found the settings; empty if the settings were given.
+        output, report: paths of the volume and of its report; None: not written.
+        elapsed, times: total time in s, and time of each phase in s.
     """
 
     volume: VolumeField = VolumeField()
@@ -117,12 +120,12 @@ class ReconRecord:
 
     @property
     def unit(self) -> str:
-        """Unit of the voxels; empty for shares."""
+        """Unit of the voxels; empty for fractions."""
         return self.kind.unit(self.length_unit)
 
     @property
     def method(self) -> str:
-        """Name of the method; for `auto`, of the one that it chose. Empty in a file of another program."""
+        """Name of the method; for `auto`, of the chosen method. Empty for a file of another program."""
         return str(self.parameters.get("method", ""))
 
     @property
@@ -143,34 +146,34 @@ class ReconRecord:
 
     @property
     def seconds_of_volumes(self) -> tuple[float, ...]:
-        """Time of each of several volumes, in s from the first projection on; empty for one volume."""
+        """Time of each volume of a series, in s after the first projection. Empty if there is only one volume."""
         return () if self.series is None else tuple(self.series.seconds.tolist())
 
     @property
     def figures(self) -> Mapping[str, float]:
-        """Figures of merit; the name of `metrics` in scripts."""
+        """Figures of merit: the same as `metrics`, under the name that scripts use."""
         return self.metrics
 
     @property
     def settings(self) -> Mapping[str, Value]:
-        """Settings; the name of `parameters` in scripts."""
+        """Settings: the same as `parameters`, under the name that scripts use."""
         return self.parameters
 
     @property
     def units(self) -> str:
-        """Unit of the voxels; the name of `unit` in scripts."""
+        """Unit of the voxels: the same as `unit`, under the name that scripts use."""
         return self.unit
 
     def __repr__(self) -> str:
         return f"ReconRecord({self.method}: {' x '.join(map(str, self.grid.shape))} voxels, {self.output})"
 
     def _repr_html_(self) -> str:
-        """HTML for a notebook: the figures and the volume's middle slices."""
+        """HTML for a notebook: the figures of merit and the middle slices of the volume."""
         figures = ", ".join(f"{name} {value:.4g}" for name, value in self.metrics.items())
         return f"<p>{self.method}: {figures}</p>{self.volume._repr_html_()}"
 
     def event_values(self) -> dict[str, Any]:
-        """Values of the event `done`, by name, in the order of its line."""
+        """The values of the event `done` by name, in the order in which the event lists them."""
         others = {
             "times_s": self.seconds_of_volumes or None,
             "hiding": self.hiding or None,
@@ -194,5 +197,7 @@ class ReconRecord:
 
 
 def recorded_ending(ending: Ending) -> dict[str, Value]:
-    """The parameters that state how a reconstruction ended; empty for one that restarted and was completed."""
+    """The parameters that state how a reconstruction ended. Empty for a reconstruction that was resumed and then
+    completed.
+    """
     return {name: value for name, field in _ENDS.items() if (value := getattr(ending, field))}

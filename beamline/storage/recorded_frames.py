@@ -1,4 +1,4 @@
-"""Frames in a scan file of this program: their table, and rows that no longer match their checksum."""
+"""Reads the table of the frames in a scan file of this program, and finds rows that no longer match their checksum."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ from drivers.base.frame import FrameKind
 from recon.base.arrays import I64, Mask
 
 _RECORD = np.dtype([(path, layout.COLUMNS[path][0]) for path in layout.RECORDED])
-"""56 bytes, little-endian, without gaps."""
+"""The record of a frame for its checksum: 56 bytes, little-endian, without gaps."""
 
 
 def frames_in(file: h5py.File, n: int | None = None) -> FrameTable:
-    """The table of the first n frames, as the log in the file records them, without flags.
+    """The table of the first n frames, from the log in the file. Flags are not included.
 
-    Alignment frames aside are offset projections; frames whose record differs from its checksum are INVALID.
+    Alignment frames with the sample moved sideways become offset projections. Frames whose record differs from its
+    checksum become INVALID.
 
     Args:
         n: number of frames; None: all committed frames.
 
     Raises:
-        ValueError: a column is not as `create` made it, or a row claims to replace a later one.
+        ValueError: a column does not have the form that `create` gave it, or a row claims to replace a later row.
     """
     n = int(file[layout.COMMITTED][()]) if n is None else n
     columns, aside = _record(file, n), None
@@ -47,8 +48,8 @@ def frames_in(file: h5py.File, n: int | None = None) -> FrameTable:
     seconds, times = columns[layout.COUNT_TIME], columns[layout.TIME]
     return FrameTable.of(
         kinds,
-        datasets.radians(file[layout.ANGLE])[:n] + 0.0,  # no -0
-        np.where(seconds > 0, seconds, np.nan),  # some write 0 for what they do not know
+        datasets.radians(file[layout.ANGLE])[:n] + 0.0,  # avoids -0
+        np.where(seconds > 0, seconds, np.nan),  # some programs write 0 for an unknown value
         triggers=columns[layout.TRIGGER],
         framestamps=columns[layout.FRAMESTAMP],
         times=times if np.isfinite(times).any() else None,
@@ -69,18 +70,22 @@ def _part_starts(file: h5py.File) -> I64:
 
 
 def pass_ends_in(file: h5py.File) -> I64:
-    """Rows of a file at the end of each pass [pass], of those committed; empty if the scan chose nothing."""
+    """[pass] row at which each pass ends, among the committed rows. Empty if the scan does not choose between
+    passes.
+    """
     ends = np.asarray(_list_in(file, layout.PASS_ENDS), np.int64)
     return ends[ends <= int(file[layout.COMMITTED][()])] if ends.size else ends
 
 
 def decisions_in(file: h5py.File) -> tuple[dict[str, Any], ...]:
-    """What was chosen after each pass, oldest first: values of the event `next_chosen`; empty in the same way."""
+    """The choice after each pass, oldest first, as values of the event `next_chosen`. Empty if the scan does not choose
+    between passes.
+    """
     return tuple(json_object(datasets.text(line)) or {} for line in _list_in(file, layout.DECISIONS))
 
 
 def _list_in(file: h5py.File, path: str) -> Sequence[Any]:
-    """The values of a dataset, also of one that grows; none where the file does not have it."""
+    """The present values of a dataset, which may be growing. Empty if the file does not have the dataset."""
     if path not in file:
         return ()
     hdf5.look_again(file[path])
@@ -88,10 +93,11 @@ def _list_in(file: h5py.File, path: str) -> Sequence[Any]:
 
 
 def codes_of(kind: FrameKind) -> dict[str, int]:
-    """The codes of a kind of frame, by their columns: NXtomo's image key, and the finer one of the log.
+    """The codes of a kind of frame, by column: the image key of NXtomo, and the code in the log, which distinguishes
+    more kinds.
 
-    NXtomo has no image key for alignment frames, so they get a key with which other programs do not use them. An offset
-    projection is a projection of the translated sample; the log records it as an alignment frame.
+    NXtomo has no image key for alignment frames. They get a key with which other programs ignore them. The log records
+    an offset projection, for which the sample is translated, as an alignment frame.
     """
     key = {FrameKind.ALIGNMENT: FrameKind.INVALID, FrameKind.OFFSET_VIEW: FrameKind.PROJECTION}.get(kind, kind)
     return {layout.IMAGE_KEY: int(key), layout.KIND: max(int(kind), int(FrameKind.ALIGNMENT))}
@@ -100,7 +106,8 @@ def codes_of(kind: FrameKind) -> dict[str, int]:
 def record_checksums(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
     """CRC-32 [row] of the `layout.RECORDED` columns [row], by their paths.
 
-    The row of a repeated frame becomes an invalid one, but its checksum is still that of its first kind.
+    If a frame is repeated, its first row becomes invalid, but the checksum of this row is still computed with the
+    original kind.
     """
     table = np.empty(len(columns[layout.KIND]), _RECORD)
     for path in layout.RECORDED:
@@ -110,23 +117,23 @@ def record_checksums(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
 
 
 def altered_rows(file: h5py.File, n: int) -> I64:
-    """Rows, of the first n, whose record differs from its checksum.
+    """The rows among the first n whose record differs from its checksum.
 
     Raises:
-        ValueError: a column is not as `create` made it.
+        ValueError: a column does not have the form that `create` gave it.
     """
     return np.flatnonzero(_altered(_record(file, n)))
 
 
 def _record(file: h5py.File, n: int) -> dict[str, NDArray[Any]]:
-    """The columns [row] that a checksum is over, and the checksums, by their paths."""
+    """The columns [row] from which a checksum is computed, and the checksums, by path."""
     return {path: _column(file, path, n) for path in (*layout.RECORDED, layout.RECORD_CHECKSUM)}
 
 
 def _column(file: h5py.File, path: str, n: int) -> NDArray[Any]:
     column, dtype = file[path], layout.COLUMNS.get(path, ("<f8", ""))[0]
     datasets.require_real(column.dtype, f"{path} in {file.filename}")
-    if len(column) < n:  # a reader has some of them open already, see look_again
+    if len(column) < n:  # a reader may have opened some of these datasets already, see look_again
         hdf5.look_again(column)
     values = np.asarray(column[:n])
     if values.shape != (n,) or column.dtype != dtype:
@@ -135,11 +142,12 @@ def _column(file: h5py.File, path: str, n: int) -> NDArray[Any]:
 
 
 def _altered(columns: Mapping[str, NDArray[Any]]) -> Mask:
-    """True if each row differs from its checksum."""
+    """bool [row], True if the row differs from its checksum."""
     checksums = columns[layout.RECORD_CHECKSUM]
     good = np.asarray(record_checksums(columns) == checksums)
     marked = ~good & np.any([columns[path] == code for path, code in codes_of(FrameKind.INVALID).items()], axis=0)
-    for kind in FrameKind if marked.any() else ():  # as of a repeated frame, whose checksum is that of its kind
+    # for a repeated frame, the checksum was computed with its original kind
+    for kind in FrameKind if marked.any() else ():
         before = {path: np.full_like(columns[path], code) for path, code in codes_of(kind).items()}
         good[marked] |= (record_checksums({**columns, **before}) == checksums)[marked]
     return ~good

@@ -1,4 +1,4 @@
-"""recover: replaces the file of a scan whose process was killed by an ordinary file with all complete frames.
+"""recover: if the process of a scan was killed, replaces the scan file by an ordinary file with all complete frames.
 
 The frames are copied to a new file, which takes the place of the old one once it is on the disk. If the copy is
 interrupted for any reason, the old file stays unchanged.
@@ -44,16 +44,16 @@ class Recovered:
     """Result of `recover` for a file.
 
     Attributes:
-        changed: whether the file was changed.
-        frames: number of committed frames, all of which are kept.
-        dropped: frames at the end that were not committed when the process was killed, and are cut off.
+        changed: True if the file was changed.
+        frames: number of committed frames; all of them are kept.
+        dropped: number of frames at the end that were not committed when the process was killed. They are removed.
         missing: number of projections that were planned or chosen but not taken; None if the file does not contain its
             plan, and for a later part of a run.
-        lost: frames that were committed but did not reach the disk; they are cut off, together with all frames after
-            them.
-        damaged: frames that differ from their checksum; they are kept.
-        altered: frames whose row in the log differs from its checksum; they are also kept.
-        remark: a step that failed although the frames are in order; "" if none failed.
+        lost: number of frames that were committed but did not reach the disk, and of all frames after them. They are
+            removed.
+        damaged: number of frames whose pixels differ from their checksum. They are kept.
+        altered: number of frames whose row in the log differs from its checksum. They are kept.
+        remark: a step that failed although the frames are complete; "" if no step failed.
     """
 
     path: Path
@@ -88,15 +88,16 @@ class Recovered:
 
 
 def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovered:
-    """Put a closed file with the committed frames in the place of one whose process was killed, or that was cut off;
-    add the /exchange view to a closed file that does not have it.
+    """Replace a scan file whose process was killed, or that was cut off, by a closed file with the committed frames. If
+    a closed file has no /exchange view, add it.
 
     Args:
-        say: function that gets a sentence on the disk space that the copy needs.
+        say: function that gets a sentence about the disk space that the copy needs.
 
     Raises:
-        DataError: no scan of this program, a damaged one, one that a running program has open, or that changed within
-            10 s where the file system has no locks; or the disk does not take the copy. Nothing is changed then.
+        DataError: the file is not a scan of this program, it is damaged, or a running program has it open. On a file
+            system without locks, the error is also raised if the file changed within the last 10 s. It is also raised
+            if the disk failed during the copy. In all cases the file is unchanged.
     """
     if not path.is_file():
         raise DataError(f"{no_file(path)} Nothing was changed.")
@@ -106,14 +107,14 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
             "reader. End it first. Nothing was changed."
         )
     lock = None
-    with suppress(OSError):  # a file that nobody can write to may be in order
+    with suppress(OSError):  # a file without write permission may be complete
         lock = WriterLock(path, exclusive=True)
     try:
         head = superblock(path)
         if head is None:
             raise DataError(f"{path} is not an HDF5 file written by this program. Nothing was changed.")
         if not head.open_for_writing and head.end == head.size:
-            with suppress(*hdf5.ALTERED):  # its writer may have been killed when it added the view
+            with suppress(*hdf5.ALTERED):  # its writer may have been killed while it added the view
                 return _with_view(path, head)
         if in_use is None and head.open_for_writing and (age := abs(time.time() - path.stat().st_mtime)) < QUIET:
             raise DataError(
@@ -131,7 +132,7 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
             if done.lost or done.damaged:
                 done = replace(done, remark=_kept_aside(path))
             if lock is not None:
-                lock.release()  # Windows replaces no open file
+                lock.release()  # Windows cannot replace an open file
         return done
     finally:
         if lock is not None:
@@ -145,7 +146,7 @@ def require_ours(path: Path, file: h5py.File) -> None:
 
 
 def _with_view(path: Path, head: Superblock) -> Recovered:
-    """The closed file, with the /exchange view added if it lacks it."""
+    """The result for a closed file. The /exchange view is added if the file does not have it."""
     with closing(GrowingFile(path, head)) as disk, h5py.File(disk, "r") as file:
         require_ours(path, file)
         require_joined(file)
@@ -157,7 +158,7 @@ def _with_view(path: Path, head: Superblock) -> Recovered:
 
 
 def _copied(path: Path, head: Superblock, target: Path) -> Recovered:
-    """Copy the readable frames to a new file; returns what is known of them."""
+    """Copy the readable frames to a new file. Returns the facts about these frames."""
     try:
         with closing(GrowingFile(path, head)) as disk, h5py.File(disk, "r") as file:
             require_harmless(file)
@@ -166,24 +167,24 @@ def _copied(path: Path, head: Superblock, target: Path) -> Recovered:
             if frames == 0 < committed:
                 raise ValueError(f"all of its {committed} complete frames are damaged")
             ending, lost = ending_in(file), tuple(range(frames, committed))
-            with hdf5.created(target, layout.LIBVER) as made:
-                damaged = copy_rows(file, frames, made)
+            with hdf5.created(target, layout.LIBVER) as copy:
+                damaged = copy_rows(file, frames, copy)
                 if ending.status == RUNNING:
-                    ending = ScanEnding("failed", gaps_in(path, made), DIED)
+                    ending = ScanEnding("failed", gaps_in(path, copy), DIED)
                 if lost:
                     reason = (
                         f"{ending.reason} Lost, because the scan had written them but they did not reach the "
                         f"disk: {frames_text(lost)}."
                     )
                     ending = replace(ending, status="failed", reason=reason.strip())
-                state_ending(made, ending)
-                times = made[layout.TIME][()]
-                if layout.END_TIME in made and not made[layout.END_TIME][()] and np.isfinite(times).any():
-                    made[layout.END_TIME][()] = layout.iso_time(float(np.nanmax(times))).encode()
-                planned, dropped = views_planned(made), max(0, len(file[layout.DATA]) - committed)
+                state_ending(copy, ending)
+                times = copy[layout.TIME][()]
+                if layout.END_TIME in copy and not copy[layout.END_TIME][()] and np.isfinite(times).any():
+                    copy[layout.END_TIME][()] = layout.iso_time(float(np.nanmax(times))).encode()
+                planned, dropped = views_planned(copy), max(0, len(file[layout.DATA]) - committed)
                 alone = planned is not None and run_of(path.resolve().parent) == path.resolve().parent
-                missing = n_still_to_take(made) if alone else None
-                altered = tuple(altered_rows(made, frames).tolist())
+                missing = n_still_to_take(copy) if alone else None
+                altered = tuple(altered_rows(copy, frames).tolist())
     except hdf5.ALTERED as error:
         if isinstance(error, OSError) and error.filename == str(target):
             raise
@@ -195,19 +196,20 @@ def _copied(path: Path, head: Superblock, target: Path) -> Recovered:
 
 
 def _kept_aside(path: Path) -> str:
-    """A sentence on the second name that a damaged file gets, as frames of it are lost."""
+    """A sentence about the second name that a damaged file keeps, because some of its frames are lost."""
     kept = path.with_name(f"{path.name}.damaged")
     try:
-        if not (kept.exists() and kept.samefile(path)):  # as after a recovery that died before its last step
+        # also true after a recovery that was killed before its last step
+        if not (kept.exists() and kept.samefile(path)):
             refuse_existing(kept)
             kept.hardlink_to(path)
-    except OSError:  # a disk without links
+    except OSError:  # a disk without hard links
         shutil.copy2(path, kept)
     return f"The damaged file was renamed to {kept}."
 
 
 def _frames_there(file: h5py.File) -> int:
-    """Number of frames up to the last committed one whose row and pixels are as they were written."""
+    """Number of frames up to the last committed frame whose row and pixels match their checksums."""
     n = min(int(file[layout.COMMITTED][()]), len(file[layout.DATA]), len(file[layout.PREVIEW]))
     for path in layout.growing(file):
         n = _most_rows(file[path], n)
@@ -216,7 +218,9 @@ def _frames_there(file: h5py.File) -> int:
 
 
 def _most_rows(column: h5py.Dataset, most: int) -> int:
-    """Number of rows from the first on that can be read, `most` at most: those of a readable part can be, too."""
+    """Number of rows, counted from the first row, that can be read; at most `most`. Found by bisection: if the first n
+    rows can be read, the first n - 1 can be read, too.
+    """
     least, most = 0, min(most, len(column))
     while least < most:
         half = (least + most + 1) // 2

@@ -1,7 +1,7 @@
-"""ScanFile: a scan file of this program, opened for reading while it may still grow. Every command that reads frames
-of such a file reads them through it.
+"""ScanFile: a scan file of this program, opened for reading while it may still grow. All commands that read frames of
+such a file use it.
 
-The paths are those of `writers.layout`; nothing is searched for. Files of other programs are opened by the list of
+Data are read at the paths in `writers.layout`, without a search. Files of other programs are opened by the list of
 formats (`readers.formats`).
 """
 
@@ -21,20 +21,20 @@ from beamline.storage.writers import layout
 class ScanFile:
     """A scan file of this program. All calls must come from one thread (HDF5).
 
-    Errors of HDF5 are not converted: callers that show them use `hdf5.readable`.
+    Errors of HDF5 are not converted. A caller that shows errors uses `hdf5.readable`.
 
     Attributes:
-        path: of the file.
+        path: path of the file.
         file: the open HDF5 file.
         data: pixels [frame, row, col]. It stays open, because HDF5 2.0 reads wrong values if a growing dataset that is
             open twice is refreshed. All other datasets are opened when they are read.
         shape: (rows, cols) of a frame.
-        dtype: of the pixels.
+        dtype: type of the pixels.
         n: frames that were complete when `committed` was last called.
     """
 
     def __init__(self, path: Path, file: h5py.File) -> None:
-        """Take over an open file."""
+        """Read an open file, which this object closes later."""
         self.path, self.file, self.n = path, file, 0
         data = datasets.dataset(file, layout.DATA)
         if data is None or data.ndim != 3:
@@ -43,11 +43,12 @@ class ScanFile:
         self.shape, self.dtype = (int(self.data.shape[1]), int(self.data.shape[2])), self.data.dtype
 
     def committed(self) -> int:
-        """The number of frames that the writer has marked as complete. If it has grown, pixels are read again.
+        """The number of frames that the writer has marked as complete. If the number has grown, the dataset of pixels
+        is refreshed.
 
         Raises:
-            DataError: fewer frames are stored.
-            ValueError: it is negative.
+            DataError: the file stores fewer frames.
+            ValueError: the stored number is negative.
         """
         n = int(self.values(layout.COMMITTED))
         if n < 0:
@@ -65,8 +66,9 @@ class ScanFile:
         return bool(self.values(layout.FINISHED))
 
     def values(self, path: str, part: Any = ()) -> Any:
-        """Values of a dataset as it is now: all of them, or a part, such as a row or a slice of the rows. KeyError: it
-        does not exist."""
+        """The present values of a dataset: all values, or a part such as a row or a slice of rows. Raises KeyError if
+        the dataset does not exist.
+        """
         item = self.file[path]
         hdf5.look_again(item)
         return item[part]
@@ -77,7 +79,7 @@ class ScanFile:
 
 
 def opened(path: Path, follow: bool = False) -> ScanFile | None:
-    """Open a scan file of this program; None if it is not one.
+    """Open a scan file of this program; None if another program wrote the file.
 
     Any file may state that this program wrote it, so it is opened with the checks of `hdf5.open_hdf5`.
 
@@ -85,8 +87,8 @@ def opened(path: Path, follow: bool = False) -> ScanFile | None:
         follow: the file may still be growing.
 
     Raises:
-        DataError: it cannot be read.
-        NotReadyError: it is missing or just being created (`follow`).
+        DataError: the file cannot be read.
+        NotReadyError: the file is missing or just being created (only with `follow`).
     """
     if path.is_dir() or not (follow or path.is_file()) or not hdf5.is_hdf5(path, follow):
         return None

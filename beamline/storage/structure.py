@@ -1,9 +1,10 @@
 """Structure of an HDF5 file: checks its objects and the other files that it refers to, before any of them is opened.
 
-HDF5 opens whatever a link names. It would wait forever for a pipe, and for the names of deeply nested groups.
+HDF5 opens whatever a link names. It would wait for ever for a pipe, or while it reads the names of deeply nested
+groups.
 
-Functions on shape, type and place of voxels raise ValueError, which the reader of a format turns into a DataError with
-the path.
+Functions on the shape, type and position of voxels raise ValueError. The reader of a format turns it into a DataError
+with the path.
 """
 
 from __future__ import annotations
@@ -25,18 +26,20 @@ from beamline.core.files import require_regular
 
 MOST_OBJECTS, DEEPEST = 50_000, 64
 CLAIMED = 1e9  # bytes
-_DAMAGED = (OSError, RuntimeError, LookupError, TypeError, ValueError)  # as h5py says it: nobody can follow that
+# h5py's text for a circle of links, which cannot be followed
+_DAMAGED = (OSError, RuntimeError, LookupError, TypeError, ValueError)
 
 
 def require_harmless(file: h5py.File) -> None:
     """Raise DataError for a file that it is not safe to read.
 
-    It has more objects or deeper groups than any scan, refers to a path that is no regular file, claims more data than
-    it has, or its values lie in another file as plain bytes.
+    A file is unsafe in any of these cases: it has more objects or deeper groups than any scan; it refers to a path that
+    is not a regular file; it states more data than it contains; its values are plain bytes in another file.
     """
     path = Path(file.filename)
     for name in dict.fromkeys(_names(file, path)):
-        # Where HDF5 looks for it: as it is named, beside this file, and by its last part next to it.
+        # HDF5 looks for the linked file in three places: under the path as written, relative to this file, and by its
+        # name alone next to this file.
         for place in (Path(name), path.parent / name, path.parent / Path(name).name):
             if place.is_dir():
                 continue
@@ -49,7 +52,7 @@ def require_harmless(file: h5py.File) -> None:
 
 
 def _names(file: h5py.File, path: Path) -> Iterator[str]:
-    """The other files that links and datasets name."""
+    """Yields the other files to which links and datasets refer."""
     groups, known = [(h5py.h5g.open(file.id, b"/"), 0)], set[tuple[int, int]]()
     while groups:
         group, depth = groups.pop()
@@ -74,38 +77,40 @@ def _names(file: h5py.File, path: Path) -> Iterator[str]:
                     groups.append((h5py.h5g.open(group, name), depth + 1))
                 elif info.type == h5py.h5o.TYPE_DATASET:
                     dataset = h5py.h5d.open(group, name)
-                    made = dataset.get_create_plist()
-                    _refuse_claim(dataset, made, f"{path}: {name.decode('utf-8', 'replace')}")
-                    if made.get_layout() == h5py.h5d.VIRTUAL:
-                        yield from (other for other, _ in drawn_on(made) if other != ".")
+                    properties = dataset.get_create_plist()
+                    _refuse_claim(dataset, properties, f"{path}: {name.decode('utf-8', 'replace')}")
+                    if properties.get_layout() == h5py.h5d.VIRTUAL:
+                        yield from (other for other, _ in drawn_on(properties) if other != ".")
 
 
-def _refuse_claim(dataset: Any, made: Any, what: str) -> None:
-    """Raise DataError for a dataset that claims more than any compression could yield of what is stored, or whose
-    values are the bytes of another file, which may be any that the reader can open.
+def _refuse_claim(dataset: Any, properties: Any, what: str) -> None:
+    """Raise DataError if a dataset states more data than any compression could make of the stored bytes. Also if its
+    values are plain bytes in another file, because this could be any file that the user may read.
     """
-    if made.get_external_count():
+    if properties.get_external_count():
         raise DataError(
-            f"{what} has its values in {os.fsdecode(made.get_external(0)[0])}, which is not an HDF5 file "
+            f"{what} has its values in {os.fsdecode(properties.get_external(0)[0])}, which is not an HDF5 file "
             "and is not read. Copy the values into the dataset. Nothing was read."
         )
-    chunk, shape = made.get_chunk() if made.get_layout() == h5py.h5d.CHUNKED else (), dataset.shape or ()
+    chunk, shape = properties.get_chunk() if properties.get_layout() == h5py.h5d.CHUNKED else (), dataset.shape or ()
     sides = [-(-side // across) * across for side, across in zip(shape, chunk, strict=True)] if chunk else shape
     n, piece = (math.prod(each) * dataset.dtype.itemsize for each in (sides, chunk))
-    if (n < CLAIMED and piece <= _LARGE) or made.get_layout() == h5py.h5d.VIRTUAL:
+    if (n < CLAIMED and piece <= _LARGE) or properties.get_layout() == h5py.h5d.VIRTUAL:
         return
     if n > PACKED * (stored := dataset.get_storage_size()) or is_blank(n, stored, piece):
         raise DataError(f"{what} states {n / 1e9:.3g} GB, but only {stored} bytes are stored. Nothing was read.")
 
 
-def drawn_on(made: Any) -> Iterator[tuple[str, str]]:
-    """(file, dataset) of each source of a virtual dataset; "." is its own file."""
-    for i in range(min(made.get_virtual_count(), MOST_OBJECTS)):
-        yield plain_name(made.get_virtual_filename(i)), plain_name(made.get_virtual_dsetname(i))
+def drawn_on(properties: Any) -> Iterator[tuple[str, str]]:
+    """(file, dataset) of each source of a virtual dataset; "." is the file that contains the virtual dataset."""
+    for i in range(min(properties.get_virtual_count(), MOST_OBJECTS)):
+        yield plain_name(properties.get_virtual_filename(i)), plain_name(properties.get_virtual_dsetname(i))
 
 
 def plain_name(written: str) -> str:
-    """The name of a source of a virtual dataset, where %% stands for %. DataError for %b, a number to be filled in."""
+    """The name of a source of a virtual dataset; %% becomes %. Raises DataError for %b, which stands for a number to be
+    filled in.
+    """
     if "%b" in written.replace("%%", ""):
         raise DataError(
             f"A virtual dataset refers to a numbered series of files, {written}, which is not supported. "
@@ -115,14 +120,16 @@ def plain_name(written: str) -> str:
 
 
 PACKED = 1e5
-"""No file of images holds so many times its own size: zeros come to 1000 times (deflate), and 20 000 (Zstandard)."""
+"""Largest ratio of data to stored bytes. No file of images exceeds it: zeros have a ratio of 1000 with deflate, and of
+20 000 with Zstandard.
+"""
 _BLANK, _LARGE = 500, 2**28
 _REAL = re.compile(r"[<>=|]?(u1|i1|[uif][248])|u?int(8|16|32|64)|float(16|32|64)")
-_LONGEST, _MOST = 2**31, 2**60  # voxels along a side, and bytes in all: far beyond any volume
+_LONGEST, _MOST = 2**31, 2**60  # most voxels along a side, and most bytes in total; far above any volume
 
 
 def is_blank(unpacked: int, stored: int, piece: int) -> bool:
-    """True if images that are unpacked in large pieces use less than a 500th of their bytes in the file.
+    """True if images in large chunks use less than a 500th of their bytes in the file.
 
     Shot noise of one count in a hundred pixels needs 0.08 bits per pixel of 16 bits, a 200th. Data that are packed more
     closely are not an image, and may have been made to fill the memory.
@@ -131,7 +138,9 @@ def is_blank(unpacked: int, stored: int, piece: int) -> bool:
 
 
 def shape_of(value: Any, what: str = "shape") -> tuple[int, int, int]:
-    """Three integers of at least 1, the shape [z, y, x] of a volume or of a chunk."""
+    """The shape [z, y, x] of a volume or of a chunk: three integers of at least 1. Raises ValueError for anything
+    else.
+    """
     sides = tuple(value) if isinstance(value, list | tuple) else ()
     if len(sides) != 3 or any(isinstance(n, bool) or not isinstance(n, int | np.integer) for n in sides):
         raise ValueError(f"its {what} is {_brief(value)}; expected three integers")
@@ -144,7 +153,7 @@ def shape_of(value: Any, what: str = "shape") -> tuple[int, int, int]:
 
 
 def numbers_of(value: Any, n: int, what: str) -> tuple[float, ...]:
-    """A tuple of `n` finite numbers."""
+    """A tuple of `n` finite numbers. Raises ValueError for anything else."""
     if not isinstance(value, list) or len(value) != n or not all(_is_number(each) for each in value):
         raise ValueError(f"its {what} is {_brief(value)}; expected {n} numbers")
     return tuple(map(float, value))
@@ -155,7 +164,7 @@ def _is_number(value: Any) -> bool:
 
 
 def dtype_of(value: Any) -> np.dtype[Any]:
-    """A type of real numbers of 1 to 8 bytes, little-endian."""
+    """The little-endian type of real numbers with 1 to 8 bytes. Raises ValueError for any other type."""
     if not isinstance(value, str) or _REAL.fullmatch(value) is None:
         raise ValueError(f"its voxels are {_brief(value)}; expected real numbers")
     return np.dtype(value).newbyteorder("<")
@@ -173,12 +182,12 @@ def require_held(shape: tuple[int, int, int], dtype: np.dtype[Any], begin: int, 
 
 def require_npy(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
     """Shape and type of an .npy; raises ValueError unless the file has all its values. The file position is kept."""
-    at, stored = file.tell(), os.fstat(file.fileno()).st_size
+    start, stored = file.tell(), os.fstat(file.fileno()).st_size
     version = np.lib.format.read_magic(file)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(file)
     needed = file.tell() + math.prod(map(int, shape)) * dtype.itemsize
-    file.seek(at)
+    file.seek(start)
     if any(n < 0 for n in shape) or needed > stored:
         raise ValueError(f"its header states the shape {_brief(shape)} of {dtype}, but the file has {stored} bytes")
     return shape, dtype

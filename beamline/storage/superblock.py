@@ -1,10 +1,10 @@
-"""Low-level blocks of HDF5: the first 48 bytes of a file, and blocks that are half written because the process was
-killed.
+"""Reads low-level blocks of HDF5: the first 48 bytes of a file, and blocks that are half written because the process
+was killed.
 
 The superblock states whether the file is being written and how many bytes it has. If the process is killed, a write may
 end at the boundary of two pages of memory. The block is then new before this boundary and old after it. Each field has
-its new or its old value, and both are valid. Only the checksum at the end of the block is wrong. (Specification 3.0:
-object headers IV.A, extensible arrays VII.D.)
+either its new or its old value, and both are valid. Only the checksum at the end of the block is wrong. (Specification
+3.0: object headers IV.A, extensible arrays VII.D.)
 
 Superblocks of versions 2 and 3 at the beginning of the file (HDF5 file format specification 3.0, II.A). Fields:
 signature 8, version 1, sizes 2, flags 1, base address 8, extension 8, end of file 8, root group 8, checksum 4 bytes,
@@ -22,10 +22,10 @@ _FLAGS, _END, _CHECKSUM = 11, slice(28, 36), slice(44, 48)
 _GROWS = 4
 _WORD = 0xFFFFFFFF
 
-_PAGE = 4096  # bytes; larger pages end where some of these do
+_PAGE = 4096  # bytes; the boundaries of larger pages are also boundaries of these
 _HEADER = b"OHDR\2"
-_OF_ITS_LENGTH = (b"EAHD\0", b"EAIB\0", b"EASB\0", b"EADB\0")  # HDF5 asks for as many bytes as these have
-_TIMES, _PHASES = 0x20, 0x10  # flags of an object header: it has these fields
+_OF_ITS_LENGTH = (b"EAHD\0", b"EAIB\0", b"EASB\0", b"EADB\0")  # HDF5 reads blocks with this number of bytes
+_TIMES, _PHASES = 0x20, 0x10  # flags of an object header: which fields it has
 
 
 @dataclass(frozen=True)
@@ -37,26 +37,26 @@ class Superblock:
 
     @property
     def open_for_writing(self) -> bool:
-        """True if a program is writing the file, or died while writing."""
+        """True if a program is writing the file, or was killed while writing it."""
         return self.head[_FLAGS] != 0
 
     @property
     def grows(self) -> bool:
-        """True if the file is being written so that others may read it meanwhile (SWMR)."""
+        """True if the file is written in such a way that others can read it at the same time (SWMR)."""
         return bool(self.head[_FLAGS] & _GROWS)
 
     @property
     def missing(self) -> int:
-        """Bytes missing at the end of the file, by its superblock."""
+        """Number of bytes that are missing at the end of the file according to the superblock."""
         return max(0, self.end - self.size)
 
     @property
     def end(self) -> int:
-        """Length of the file in bytes, as its superblock states it."""
+        """Length of the file in bytes according to the superblock."""
         return int.from_bytes(self.head[_END], "little")
 
     def closed(self, end: int) -> bytes:
-        """The head of the same file as if it had been closed with `end` bytes."""
+        """The superblock that the file would have if it had been closed with `end` bytes."""
         head = bytearray(self.head)
         head[_FLAGS] = 0
         head[_END] = end.to_bytes(8, "little")
@@ -65,8 +65,9 @@ class Superblock:
 
 
 def superblock(path: Path) -> Superblock | None:
-    """The superblock of a file; None unless the file begins with a whole one of a supported version, with addresses of
-    eight bytes."""
+    """The superblock of a file. None unless the file begins with a complete superblock of a supported version, with
+    addresses of eight bytes.
+    """
     with path.open("rb") as file:
         head = file.read(SIZE)
     if len(head) < SIZE or head[:8] != _SIGNATURE or head[8] not in (2, 3) or head[9] != 8:
@@ -75,21 +76,23 @@ def superblock(path: Path) -> Superblock | None:
 
 
 def marked_as_being_written(path: Path) -> bool:
-    """True if the file is marked as being written: a program writes it, or died while writing."""
+    """True if the file is marked as being written: a program is writing it, or was killed while writing it."""
     head = superblock(path)
     return head is not None and head.open_for_writing
 
 
 def mend_checksum(offset: int, read: memoryview) -> None:
-    """Repair the checksum of a block in `read`, the bytes from `at` on that HDF5 asked for, that a kill or a loss of
-    power left half written: across the end of a page of memory, each field is the new or the old one."""
+    """Repair the checksum of a block that is half written because the process was killed or the power failed. `read`
+    contains the bytes from position `at` on that HDF5 has requested. On either side of the end of a memory page, each
+    field has its new or its old value.
+    """
     size = block_size(read)
     if 8 < size <= len(read) and offset // _PAGE != (offset + size - 1) // _PAGE:
         read[size - 4 : size] = lookup3(bytes(read[: size - 4]))
 
 
 def block_size(read: memoryview) -> int:
-    """Length in bytes of the block that begins here, with its checksum; 0 if no known block does."""
+    """Length in bytes, including the checksum, of the block that begins here; 0 if no known block begins here."""
     kind = bytes(read[:5])
     if kind in _OF_ITS_LENGTH:
         return len(read)

@@ -1,4 +1,4 @@
-"""Volume file: a volume [z, y, x] read from TIFF, a folder of slices, NumPy, NIfTI, HDF5 or Zarr."""
+"""Reads a volume [z, y, x] from a TIFF, a folder of slices, NumPy, NIfTI, HDF5 or Zarr."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from beamline.storage.readers.side_files import reconstructed_pixel_mm
 from beamline.storage.readers.tiff import require_possible
 
 LENGTHS = MappingProxyType({0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3})
-"""mm of a metre, a millimetre and a micrometre, by NIfTI's xyzt_units; an unstated unit counts as mm."""
-_RESOLUTIONS = "YResolution", "XResolution"  # pixels to a unit, as fractions
+"""Length in mm of the units in NIfTI's xyzt_units: metre, millimetre and micrometre. An unstated unit counts as mm."""
+_RESOLUTIONS = "YResolution", "XResolution"  # pixels per unit, as fractions
 SUFFIXES = (".tif", ".tiff", ".npy", ".npz", ".nii", ".nii.gz", ".h5", ".hdf5", ".nxs")
 
 
@@ -37,10 +37,11 @@ def read_volume(
     The spacing is stated by NIfTI, OME-Zarr, TIFFs of ImageJ and OME, and by `voxel_mm` (`slice_mm`) in an .npz.
 
     Args:
-        dataset: path in an HDF5 file or a Zarr, or name in an .npz; None: the only array of three axes.
+        dataset: path in an HDF5 file or a Zarr, or name in an .npz; None: the only array with three axes.
 
     Raises:
-        DataError: no file of these kinds, not readable, too large for the memory, or no such array in it.
+        DataError: the file has none of these formats, it is unreadable, it is too large for the memory, or it does not
+            contain the array.
     """
     name = path.name.lower()
     if is_zarr(path):
@@ -79,7 +80,7 @@ def read_volume(
 def axes_of(
     file: h5py.File, dataset: str | None, unit: str = "mm"
 ) -> tuple[tuple[float, float, float] | None, tuple[float, ...] | None]:
-    """Spacing and first coordinates (z, y, x) from the arrays z, y, x next to a dataset.
+    """Voxel spacing and first coordinates (z, y, x), from the arrays z, y and x next to a dataset.
 
     None: the arrays are missing, or are not in `unit`.
     """
@@ -95,7 +96,7 @@ def axes_of(
 
 
 def _is_numpy(path: Path) -> bool:
-    """True if it is a NumPy file by its first bytes, whatever its name."""
+    """True if the first bytes are those of a NumPy file, whatever its name is."""
     with path.open("rb") as file:
         return file.read(6).startswith((b"PK", b"\x93NUMPY"))
 
@@ -111,7 +112,7 @@ def _from_tiff(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, flo
 
 
 def _tiff_spacing(tif: tifffile.TiffFile) -> tuple[float, float, float] | None:
-    """Edges of a voxel (z, y, x) in mm, as Fiji (its unit, spacing and resolutions) or OME states all three."""
+    """Edges of a voxel (z, y, x) in mm. None unless Fiji (unit, spacing and resolutions) or OME states all three."""
     facts, tags = tif.imagej_metadata or {}, tif.pages.first.tags
     edges: list[Any] = [facts.get("spacing"), *(tags[name].value if name in tags else None for name in _RESOLUTIONS)]
     units = [str(facts.get("unit")).replace("\\u00B5", "µ")] * 3
@@ -127,7 +128,7 @@ def _tiff_spacing(tif: tifffile.TiffFile) -> tuple[float, float, float] | None:
         ]
     except (TypeError, ValueError, ArithmeticError):
         return None
-    # Pixels that are no squares fit no grid: the user states an edge.
+    # A grid cannot represent pixels that are not square: the user must state an edge.
     z, y, x = mm
     return (z, y, x) if all(0 < each < math.inf for each in mm) and math.isclose(y, x, rel_tol=1e-3) else None
 
@@ -136,11 +137,11 @@ _PICTURES = (".png", ".bmp", ".jpg", ".jpeg")
 
 
 def _from_folder(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:
-    """The slices of a folder, in the order of the numbers in their names, and the edges of a voxel in mm, if the log of
-    NRecon next to them states one.
+    """The slices in a folder, in the order of the numbers in their names. Also the edges of a voxel in mm, if the log
+    of NRecon next to them states the size.
 
-    Slices are the TIFFs, or else the grey pictures, whose names differ in numbers alone; a single one of another name,
-    such as a preview, is none.
+    Slices are the TIFFs whose names differ only in numbers; if there are none, the grey pictures. A single file with
+    another name, such as a preview, is not a slice.
     """
     names = natural_sorted(item.name for item in path.iterdir() if not item.name.startswith("."))
     by_kind = ([name for name in names if name.lower().endswith(kind)] for kind in ((".tif", ".tiff"), _PICTURES))
@@ -148,7 +149,8 @@ def _from_folder(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, f
     for name in next(filter(None, by_kind), []):
         series.setdefault(re.sub(r"-?\d+", "#", name), []).append(name)
     files = max(series.values(), key=len, default=[])
-    if len({re.sub(r"\d+", "#", name) for name in files}) > 1:  # z-1 beside z1: a sign, no hyphen
+    # if there is a z-1 as well as a z1, the mark is a sign and not a hyphen
+    if len({re.sub(r"\d+", "#", name) for name in files}) > 1:
         files.sort(key=lambda name: [int(number) for number in re.findall(r"-?\d+", name)])
     files = files if len(files) > 1 else [name for some in series.values() for name in some]
     if not files:
@@ -170,7 +172,7 @@ def _from_folder(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, f
     for z, name in enumerate(files):
         try:
             values = _of_picture(path / name) if name.lower().endswith(_PICTURES) else _from_tiff(path / name)[0]
-        except Exception as error:  # as of other foreign files
+        except Exception as error:  # as for other files of other programs
             raise DataError(f"{path / name} cannot be read ({type(error).__name__}: {error}).") from error
         if slices is None:
             require_room(path, values.nbytes * len(files))
@@ -187,7 +189,7 @@ def _from_folder(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, f
 
 
 def _of_picture(path: Path) -> NDArray[np.generic]:
-    """A picture [y, x] whose colours, if it has any, are greys."""
+    """A picture [y, x]. It may have colours if all of them are greys."""
     with Image.open(path) as picture:
         if picture.mode.startswith(("L", "I", "F")) and picture.mode != "LA":
             return np.asarray(picture)
@@ -198,9 +200,10 @@ def _of_picture(path: Path) -> NDArray[np.generic]:
 
 
 def _from_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, float]]:
-    """NIfTI (Cox et al. 2004): values scaled as the header says, and mm between voxels along z, y, x.
+    """Reads NIfTI (Cox et al. 2004): the values, scaled as the header states, and the voxel spacing in mm along z, y,
+    x.
 
-    Scaled values are float32, others of the file's type. The orientation of the patient is not applied.
+    Scaled values are float32; other values have the type in the file. The orientation of the patient is not applied.
     """
     try:
         import nibabel
@@ -217,7 +220,7 @@ def _from_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, fl
     if unit is None or not (np.isfinite(steps).all() and steps.all()):
         raise DataError(f"{path} states voxels of {steps} in the unit {image.header['xyzt_units']}; expected lengths.")
     require_room(path, math.prod(shape) * dtype.itemsize)
-    values = np.asarray(image.dataobj).T.reshape(shape[2::-1])  # [x, y, z], then any axes of length 1
+    values = np.asarray(image.dataobj).T.reshape(shape[2::-1])  # [x, y, z], then any number of axes of length 1
     x, y, z = (float(step) * unit for step in steps)
     scaled = values.dtype.newbyteorder("=") != dtype.newbyteorder("=")
     return values.astype(np.float32 if scaled else dtype.newbyteorder("=")), (z, y, x)
@@ -258,7 +261,8 @@ def _from_hdf5(
 def _only(path: Path, axes: dict[str, int]) -> str:
     volumes = [name for name, n in axes.items() if n == 3]
     if len(volumes) != 1:
-        from beamline.storage.readers.open import scan_format  # here: what reads a volume needs no reader of scans
+        # imported here, because the reader of a volume does not need the readers of scans
+        from beamline.storage.readers.open import scan_format
 
         if (scan := scan_format(path)) is not None:
             raise DataError(

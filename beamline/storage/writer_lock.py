@@ -1,9 +1,9 @@
-"""Locks on files: those of this program on a file that is being written, and failures of HDF5's own locks.
+"""Locks on files: the lock of this program on a file that is being written, and failures of HDF5's own locks.
 
-The lock of this program shows that a writer is alive, even if it writes nothing for a long time. The operating system
-releases the lock when the program ends for any reason. HDF5 holds no lock on a file that others may follow, but it
-locks every file that it creates or opens for ordinary reading. On a file system without locks (many NFS mounts) this
-fails.
+The lock of this program shows that a writer is alive, even if the writer writes nothing for a long time. The operating
+system releases the lock when the program ends, for whatever reason. HDF5 has its own locks: it locks every file that it
+creates or opens for ordinary reading, but not a file that others may follow. On a file system without locks (many NFS
+mounts), HDF5's locking fails.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import h5py
 
-QUIET = 10.0  # s without a change, after which no program is taken to write the file, where locks do not say it
+QUIET = 10.0  # s without a change, after which nobody is assumed to be writing the file; for file systems without locks
 
-PATIENCE = 120.0  # s without a new frame, after which a growing file without the lock of its writer is given up
-_LOOK = 1.0  # s between looks whether the writer still holds its lock
+PATIENCE = 120.0  # s without a new frame, after which the writer of a growing file without a lock is assumed to be dead
+_LOOK = 1.0  # s between two checks whether the writer still holds its lock
 
-_TRIES, _PAUSE = 20, 0.005  # real s between tries for a lock
+_TRIES, _PAUSE = 20, 0.005  # real s between attempts to take a lock
 
 if sys.platform == "win32":
     import msvcrt
 
-    _BEYOND = 2**62  # a byte that no file has: Windows lets nobody read or write one that is locked
+    _BEYOND = 2**62  # a byte beyond the end of any file, because Windows lets nobody read or write a locked byte
 
     def _lock(file: int, *, exclusive: bool) -> None:
         os.lseek(file, _BEYOND, os.SEEK_SET)
@@ -44,7 +44,7 @@ else:
     import fcntl
 
     def _lock(file: int, *, exclusive: bool) -> None:
-        # Shared by the writer, because HDF5 takes a shared lock to open a file for reading.
+        # The writer takes a shared lock, because HDF5 takes a shared lock when it opens a file for reading.
         fcntl.flock(file, (fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH) | fcntl.LOCK_NB)
 
 
@@ -55,14 +55,14 @@ _OFF = {"FALSE", "0", "BEST_EFFORT"}
 
 
 class LockFailure(Enum):
-    """Why HDF5 got no lock."""
+    """The reason why HDF5 could not lock a file."""
 
     NO_LOCKS = "no locks"
     HELD = "held"
 
 
 def lock_failure(error: BaseException) -> LockFailure | None:
-    """Why a file could not be locked, from an error of h5py; None if that is another error."""
+    """The reason why a file could not be locked, from an error of h5py. None if the error has another cause."""
     match = re.search(r"unable to lock file, errno = (\d+)", str(error))
     if match is None:
         return None
@@ -70,8 +70,8 @@ def lock_failure(error: BaseException) -> LockFailure | None:
 
 
 def no_locks(folder: Path) -> str:
-    """A sentence if files in a folder cannot be locked, so that HDF5 cannot create files there; "" if they can, if HDF5
-    is set to use no locks, or if that is unknown.
+    """A sentence if files in a folder cannot be locked, because HDF5 then cannot create files there. "" if files can be
+    locked, if HDF5 is set to use no locks, or if it is unknown.
     """
     if os.environ.get(SWITCH, "").upper() in _OFF:
         return ""
@@ -85,7 +85,7 @@ def no_locks(folder: Path) -> str:
 
 
 def no_locks_sentence(place: Path, number: int | None = None) -> str:
-    """A sentence with the cause and the remedy."""
+    """A sentence with the cause and what to do."""
     number_text = "" if number is None else f" (errno {number})"
     return (
         f"the file system of {place} has no file locks{number_text}, which is common with NFS, so HDF5 cannot create a "
@@ -95,15 +95,15 @@ def no_locks_sentence(place: Path, number: int | None = None) -> str:
 
 
 def opened_whole(path: Path, *, unlocked: bool = True) -> h5py.File:
-    """Open for reading a file that no program is writing; without a lock if its file system has none.
+    """Open a file for reading that no program is writing. If the file system has no locks, open it without a lock.
 
     Args:
-        unlocked: may be opened without a lock.
+        unlocked: True if the file may be opened without a lock.
 
     Raises:
-        OSError, ValueError: as h5py.File.
+        OSError, ValueError: the same errors as h5py.File.
     """
-    import h5py  # a command that only asks about locks, and its help, load without it
+    import h5py  # imported here, so that a command that only asks about locks, and its help, start without it
 
     try:
         return h5py.File(path, "r")
@@ -114,36 +114,37 @@ def opened_whole(path: Path, *, unlocked: bool = True) -> h5py.File:
 
 
 class WriterLock:
-    """A lock held until `release`, or until this process ends. There is no lock if the file system has none.
+    """A lock that is held until `release`, or until this process ends. On a file system without locks it does nothing.
 
     Args:
-        exclusive: take an exclusive lock, and raise OSError if another process holds one; else a shared one.
+        exclusive: True: take an exclusive lock, and raise OSError if another process holds a lock. False: take a shared
+            lock.
     """
 
     def __init__(self, path: Path, *, exclusive: bool = False) -> None:
         file = os.open(path, os.O_RDWR)
         self.release = weakref.finalize(self, os.close, file)
-        for left in reversed(range(_TRIES)):
+        for tries_left in reversed(range(_TRIES)):
             try:
                 _lock(file, exclusive=exclusive)
                 return
             except (BlockingIOError, PermissionError):
-                if left:
-                    time.sleep(_PAUSE)  # `held` has the lock for a moment
+                if tries_left:
+                    time.sleep(_PAUSE)  # the function `held` briefly holds the lock
                 elif exclusive:
                     self.release()
                     raise
-            except OSError:  # no locks on this disk
+            except OSError:  # the file system has no locks
                 return
 
 
 def held(path: Path, *, exclusively: bool = False) -> bool | None:
-    """True if a running program has the file open, as far as locks tell; False if the file cannot be opened, None if
-    its file system has no locks.
+    """True if a running program holds a lock on the file. False also if the file cannot be opened. None if the file
+    system has no locks.
 
     Args:
-        exclusively: True if the holder of this file locks it exclusively. Several processes can then ask at the same
-            time without blocking one another (except on Windows).
+        exclusively: True if the holder locks this file exclusively. Then several processes can call this function at
+            the same time without blocking each other (except on Windows).
     """
     writable = not exclusively and os.access(path, os.W_OK)
     try:
@@ -154,7 +155,7 @@ def held(path: Path, *, exclusively: bool = False) -> bool | None:
         _lock(file, exclusive=not exclusively)
     except (BlockingIOError, PermissionError):
         return True
-    except OSError:  # no locks on this disk
+    except OSError:  # the file system has no locks
         return None
     finally:
         os.close(file)
@@ -162,19 +163,20 @@ def held(path: Path, *, exclusively: bool = False) -> bool | None:
 
 
 def abandoned(path: Path) -> bool:
-    """True if no program seems to write the file: it has not changed for QUIET s, and no running program has it
-    open."""
+    """True if nobody seems to be writing the file: it has not changed for QUIET s, and no running program has it
+    open.
+    """
     return time.time() - path.stat().st_mtime > QUIET and not held(path)
 
 
 class WriterWatch:
-    """Detects, for the follower of a growing file, that its writer has died: at once by the lock, or else by its
-    silence.
+    """Tells the reader of a growing file when the writer has died: at once if there are locks, otherwise after some
+    time without new frames.
 
     Args:
-        now: s, by the clock of the follower.
-        patience: s without a frame, after which a file without a lock counts as one whose process was killed. With the
-            lock the writer waits: for the operator, the beam, or a long exposure.
+        now: clock of the reader, in s.
+        patience: s without a new frame, after which the writer of a file without a lock counts as dead. If the writer
+            holds the lock, it is waiting for the operator, for the beam, or for a long exposure.
     """
 
     def __init__(self, path: Path, now: float, patience: float = PATIENCE) -> None:
@@ -183,12 +185,12 @@ class WriterWatch:
         self._was_held = self._held = held(path)
 
     def lost(self, now: float, grew: bool, finished: Callable[[], bool]) -> str:
-        """How the loss of the writer was detected, as the end of a sentence; "" if it was not.
+        """How the death of the writer was detected, as the end of a sentence; "" if the writer is alive.
 
         Args:
             grew: True if the file has grown since the last call.
-            finished: function that reads from the file whether the scan has ended; the lock is released after the end
-                is written.
+            finished: function that reads from the file whether the scan has ended. The writer releases the lock only
+                after it has written the end.
         """
         if now - self._last_look >= _LOOK:
             self._last_look, self._was_held, self._held = now, self._held, held(self._path)

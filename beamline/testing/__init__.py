@@ -24,7 +24,9 @@ from drivers.base.frame import FrameKind
 
 
 class ReaderConformance:
-    """Laws of `beamline.storage.readers.base.ScanSource`, of a finished scan that is recognised by its path."""
+    """Tests that a `beamline.storage.readers.base.ScanSource` must pass, for a finished scan that is recognised by its
+    path.
+    """
 
     @pytest.fixture
     def path(self, tmp_path: Path) -> Path:

@@ -10,7 +10,7 @@ from typing import Any
 class DeviceError(Exception):
     """A device did not carry out a request.
 
-    The message is one readable paragraph; its parts are attributes.
+    The message is one readable paragraph. The parts of the message are also attributes.
 
     Attributes:
         device: name of the device.
@@ -49,8 +49,9 @@ class DeviceError(Exception):
         return __newobj__, (type(self), *self.args), vars(self)
 
     def told_by(self, device: str, problem: str, **changed: str) -> DeviceError:
-        """The same error, reported by `device`, which uses the device that failed. `changed` contains the parts of the
-        error to replace."""
+        """The same error as an error of `device`, which uses the device that failed. `changed` contains the parts of
+        the error that are replaced.
+        """
         parts = ("request", "reply", "expected", "advice", "state", "wire")
         return type(self)(device, problem, **({part: getattr(self, part) for part in parts} | changed))
 

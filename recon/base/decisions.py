@@ -20,12 +20,15 @@ class MaterialPrior(NamedTuple):
         tv_share: weight of total variation if voxels are pulled, divided by the weight without a pull.
         pull: factor c of the step c (z - x) from the voxels x towards the levels z. The step that fits the projections
             has the factor 1.
+        noise: standard deviation of the noise of a voxel, divided by the gap between levels. The smaller it is, the
+            fewer voxels between two levels are pulled. Volumes by earlier versions used 0.2.
     """
 
     levels: tuple[float, ...] = ()
     weights: tuple[float, ...] = ()
     tv_share: float = 1.0
     pull: float = 0.0
+    noise: float = 0.2
 
     def scaled(self, power: int) -> MaterialPrior:
         """The same levels in units in which all densities are 2^power times as large."""

@@ -58,18 +58,19 @@ class Geometry:
         pixel_pitch: size of a detector pixel in mm. For a parallel beam, the size is measured at the sample; for a cone
             beam, on the detector. If the pitch of a parallel beam is 1.0, all lengths are in pixels.
         axis_col, axis_row: column of the rotation axis, and row of the height z = 0, on the detector. For a cone beam,
-            the row is that of the central ray. Both are in pixels, 0 at the centre of the first column or row.
+            the row is that of the central ray. `axis_col` and `axis_row` are in pixels, 0 at the centre of the first
+            column or row.
         sod, sdd: mm from the source to the rotation axis and to the detector; both infinite for a parallel beam.
         shifts: float64 [view, 2], displacement of each projection in pixels (col, row).
         roll: float64 [view], radians; rotation of the detector about the beam. The column number of the rolled detector
             grows along u cos(roll) + v sin(roll).
         tilt: float64 [view], radians; tilt of the rotation axis along the beam. The row number of a tilted projection
             grows along v cos(tilt) + d sin(tilt), with d the direction of the beam.
-        width: width of all rays; see `seen_with`.
+        width: the causes that make rays wide (`RayWidth`); the same for all rays.
         skew: angle in radians by which the stage turns from the readout of one row to the next (parallel beam only);
             `angles` are the angles of the first row.
         centres: float64 [view, 3], (x, y, z) in mm (cone beam only): the point that lies at the distance `sod` from the
-            source, along the beam of the projection. If left out, this point is the origin.
+            source, along the beam of the projection. If `centres` is left out, this point is the origin.
     """
 
     angles: F64
@@ -221,8 +222,7 @@ class Geometry:
 
     @property
     def lean(self) -> float:
-        """Largest displacement along the rotation axis that roll and tilt give a point in the field of view, in mm at
-        the rotation axis."""
+        """Largest distance in mm, along the rotation axis, by which roll and tilt move a point in the field of view."""
         across = np.abs(np.sin(self.roll)) + np.abs(np.sin(self.tilt))
         return self.reach * float(across.max())
 
@@ -231,9 +231,9 @@ class Geometry:
         """Angle in radians after which projections repeat the same rays: π for a parallel beam with the axis in the
         middle, otherwise 2π.
 
-        The period is 2π in three cases: for a cone beam; if the axis is tilted along the beam so much that the edge of
-        the field of view moves by more than half a pixel; and if the axis is off the detector's middle by more than a
-        twentieth of the detector's width, because opposite projections then see different parts of the sample.
+        The period is 2π in three cases. (1) The beam is a cone. (2) The axis is tilted along the beam so much that the
+        edge of the field of view moves by more than half a pixel. (3) The axis is off the detector's middle by more
+        than a twentieth of the detector's width: opposite projections then see different parts of the sample.
         """
         leans = self.reach * float(np.abs(np.sin(self.tilt)).max()) > 0.5 * self.sample_pitch
         return 2 * math.pi if self.is_cone or leans or self.is_off_middle else math.pi
@@ -242,15 +242,17 @@ class Geometry:
     def unseen_cone(self) -> float:
         """Half angle in radians of the cone about the rotation axis, in Fourier space, that no projection measures.
 
-        This angle is the smallest tilt of the axis along the beam. It is 0 if this tilt moves the edge of the field of
-        view by at most half a pixel.
+        This angle is the smallest tilt of the axis along the beam. The angle is 0 if this tilt moves the edge of the
+        field of view by at most half a pixel.
         """
         least = float(np.abs(self.tilt).min())
         return least if self.reach * math.sin(least) > 0.5 * self.sample_pitch else 0.0
 
     @property
     def is_off_middle(self) -> bool:
-        """Whether the axis is off the detector's middle by more than a twentieth of its width (half acquisition)."""
+        """Whether the axis is off the detector's middle by more than a twentieth of the detector's width (half
+        acquisition).
+        """
         cols = self.detector_shape[1]
         axis = (self.axis_col + self.offsets[:, 0])[self.is_centred]
         return abs(float(axis.mean()) - (cols - 1) / 2) > _OFF_MIDDLE * cols
@@ -265,7 +267,7 @@ class Geometry:
 
     @property
     def offsets(self) -> F64:
-        """Pixels (col, row) from (axis_col, axis_row) to the image of the object's origin, [view, 2]."""
+        """[view, 2] pixels (col, row): how far the image of the object's origin lies from (axis_col, axis_row)."""
         if not self.centres.any():
             return self.shifts
         u, v, w = np.einsum("vij,vj->iv", [self.axes(view) for view in range(self.n_views)], -self.centres)
@@ -358,8 +360,8 @@ class Geometry:
         projections.
 
         Raises:
-            ValueError: the angles are not valid. Or shift, roll, tilt or centre differ between projections, so that the
-                values at the new angles are unknown.
+            ValueError: there are no angles, an angle is not finite, or shift, roll, tilt or centre differ between
+                projections. If they differ, their values at a new angle are unknown.
         """
         for name in _OF_VIEWS[1:]:
             widest = float(np.ptp(getattr(self, name), axis=0).max())
@@ -390,11 +392,11 @@ class Geometry:
         return replace(self, **lengths, centres=frozen(factor * self.centres))
 
     def seen_with(self, width: RayWidth, skew: float = 0.0) -> Geometry:
-        """The same projections, with a ray width and with a skew: the angle from one row to the next (rolling shutter).
+        """The same projections with rays of this width, and with this skew (see the attributes of `Geometry`).
 
         Raises:
-            ValueError: the skew is not finite. Or the skew is not 0 and the beam is a cone, or projections are rolled
-                or tilted: a slice of the volume then does not belong to one row.
+            ValueError: the skew is not finite. A skew other than 0 also raises the error for a cone beam, and for
+                rolled or tilted projections, because one detector row then sees several slices.
         """
         return replace(self, width=width, skew=float(skew))
 
@@ -419,8 +421,8 @@ class Geometry:
         """The same geometry for detector rows start..stop.
 
         For a parallel beam, z = 0 moves to the middle of these rows, so that a slab can be treated as a separate scan.
-        For a cone beam, the central ray stays at its position, and so does the point about which projections are rolled
-        and tilted.
+        For a cone beam, the central ray and the point about which projections are rolled and tilted stay where they
+        are.
         """
         rows = self.detector_shape[0]
         if not 0 <= start < stop <= rows:

@@ -18,10 +18,10 @@ class Kernel(StrEnum):
         compact:1.5    (1 - q / R²)₊^m,   m = 3/2,   R² = 2 m + 5
 
     R is chosen so that both kernels have the same second moment. Therefore a covariance describes the same width for
-    both. The line integral of the compact kernel has the same form with exponent m + 1/2, which is a polynomial for m =
-    3/2. The compact kernel has a finite radius, so it need not be cut off. ∫ (1
+    both kernels. The line integral of the compact kernel has the same form with exponent m + 1/2, which is a polynomial
+    for m = 3/2. The compact kernel has a finite radius, so it need not be cut off. ∫ (1
     - t² - s²)₊^m ds = √π Γ(m + 1) / Γ(m + 3/2) (1 - t²)₊^(m + 1/2). The projection of the compact kernel is steeper at
-    the edge and has no tail. This suits samples with sharp edges.
+    the edge and has no tail. The compact kernel suits samples with sharp edges.
     """
 
     GAUSSIAN = "gaussian"

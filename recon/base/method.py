@@ -49,8 +49,8 @@ class Progress:
             latest steps used.
         n_gaussians, n_views: number of Gaussians in the model and of projections in the data.
         held_out: ||rendered - measured|| / ||measured|| of the held-out projections; NaN if there are none.
-        unit: what `step` counts in a direct method, or in a part of the work, such as "slices". Empty: `step` counts
-            fitting steps or iterations. If `unit` is not empty, loss and residual are NaN.
+        unit: what `step` counts in a direct method, or in a part of the work, such as "slices". If `unit` is empty,
+            `step` counts fitting steps or iterations. If `unit` is not empty, loss and residual are NaN.
     """
 
     step: int
@@ -80,8 +80,8 @@ class DataUse(Checked):
         weights: weight of each ray [view, row, col], 0 or more; None: 1 everywhere. FBP interpolates rays of weight 0
             from their neighbours, and gives all other rays the same weight.
         held_out: numbers of the projections that are not fitted; their residual is in the history.
-        times: [view] time of each exposure in s, for a method that makes volumes at several times. None: the exposures
-            are evenly spaced in time, in the order of the projections.
+        times: [view] time of each exposure in s, for a method that makes volumes at several times. If `times` is None,
+            the exposures are evenly spaced in time, in the order of the projections.
         sample_radius: mm from the rotation axis to the edge of a sample that is wider than the field of view; None: it
             is measured.
     """
@@ -97,17 +97,18 @@ class RunControl(Checked):
     """How a caller follows, stops and resumes a reconstruction.
 
     Attributes:
-        should_stop: function (or a `Stop`) that is called between steps or iterations. If it returns True, the
-            reconstruction ends with the volume reached so far. Direct methods do not call `should_stop`. Methods call
-            it through the property `stop`, which exists even if `should_stop` is None.
+        should_stop: function (or a `Stop`) that is called between steps or iterations. If `should_stop` returns True,
+            the reconstruction ends with the volume reached so far. Direct methods do not call `should_stop`. Methods
+            call `should_stop` through the property `stop`, which exists even if `should_stop` is None.
         on_progress: function that gets the progress: about ten times a second in a fit, after each iteration, or after
             every sixteen slices of FBP.
         on_checkpoint: function that gets the checkpoint of a fit every `checkpoint_every` s.
         resume: checkpoint from which a fit with the same data and settings continues.
-        decide: records the decisions that the method derives from its data. With the decisions of an earlier run, the
-            method repeats them. None: the method decides by itself.
+        decide: records the decisions that the method derives from its data. If it contains the decisions of an earlier
+            run, the method repeats them. If `decide` is None, the method decides by itself.
         stop_trials: function that is called after each iteration of the test reconstructions that choose the weight of
-            total variation. If it returns True, only the test reconstructions end. None: same as `should_stop`.
+            total variation. If `stop_trials` returns True, only the test reconstructions end. None: same as
+            `should_stop`.
     """
 
     should_stop: Callable[[], bool] | None = None
@@ -121,13 +122,16 @@ class RunControl(Checked):
 
     @property
     def stop(self) -> Stop:
-        """The `Stop` that methods call between steps. It returns True if the run must end with the volume reached so
-        far."""
+        """The `Stop` that methods call between steps. The call returns True if the run must end with the volume reached
+        so far.
+        """
         return self.should_stop if isinstance(self.should_stop, Stop) else Stop(self.should_stop or _never)
 
     @property
     def stop_of_trials(self) -> Callable[[], bool]:
-        """The function that test reconstructions call between iterations. It returns True if they must end."""
+        """The function that test reconstructions call between iterations. It returns True if the test reconstructions
+        must end.
+        """
         return self.stop_trials or self.stop
 
     def tell(self, progress: Progress) -> None:
@@ -142,7 +146,7 @@ class RunControl(Checked):
             self.on_progress(Progress(step, steps, self.now() - begin, math.nan, math.nan, 0, n_views, unit=unit))
 
     def by(self, deadline: float) -> RunControl:
-        """The same control with a deadline in s of its clock."""
+        """The same control with a deadline: the run ends when the clock of this control shows `deadline` (s)."""
         return replace(self, should_stop=self.stop.by(deadline, self.now))
 
 
@@ -228,23 +232,23 @@ class Reconstruction:
         gaussians: the Gaussian model of a fit, a `recon.splatting.gaussians.Gaussians` (this module must not import
             it); None for other methods.
         checkpoint: state of a fit for `RunControl.resume`; see `checkpoint.arrays_of`.
-        method: name of the method; for `recon.Auto`, of the chosen method. `run` may leave it empty for the caller to
-            fill in.
-        seconds: wall time of the reconstruction. `run` may leave it 0 for the caller to fill in.
+        method: name of the method; for `recon.Auto`, of the chosen method. `run` may leave `method` empty for the
+        caller to fill in. seconds: wall time of the reconstruction. `run` may leave `seconds` 0 for the caller to fill
+            in.
         deviation: standard deviation of each voxel, see `recon.error_bars`; None: not computed.
-        series: all volumes of a method that makes several, of which the first is also `volume`. None: the method makes
-            one volume.
+        series: all volumes of a method that makes several volumes; the first one is also `volume`; None for a method
+            that makes one volume.
         at: function that returns the volume [z, y, x] at a time (as in `DataUse.times`), or for the number of an
-            energy. None: the method makes one volume.
+            energy; None for a method that makes one volume.
         chosen: how an automatic choice or a preset found the settings; empty if they were given.
         started_from: number of Gaussians at the start of a fit; 0 for other methods.
-        ending: how the run ended. The caller of `run` fills in this value.
+        ending: how the run ended. The caller of `run` fills in `ending`.
         outside: function that returns the contribution of the sample outside the volume to the projections of a
             geometry, [view, row, col]; None: no such contribution is known.
-        change: the volume minus the reference, after the reference was moved to the position of the volume. None: no
+        change: the volume minus the reference, after the reference was moved to the position of the volume; None if no
             reference was used.
         displacement: [3, z, y, x] in mm along z, y, x: the position of a point in the reference minus its position in
-            the volume. None: no reference was used.
+            the volume; None if no reference was used.
     """
 
     volume: Volume
@@ -280,8 +284,8 @@ class Reconstruction:
         """Write the volume and its settings to the new file `path`, an .npz; `beamline export` converts it.
 
         The file contains the arrays of `Volume.save`, and `method`, `seconds` and `settings`. `settings` is JSON that
-        also contains NaN and Infinity, as Python writes them. If there are several volumes in time, it also contains
-        `series` float32 [volume, z, y, x] and `series_s`.
+        also contains NaN and Infinity, as Python writes them. If there are several volumes in time, the file also
+        contains `series` float32 [volume, z, y, x] and `series_s`.
         """
         several = {} if self.series is None else {"series": self.series.data, "series_s": self.series.seconds}
         self.volume.save(
@@ -294,9 +298,9 @@ class Reconstruction:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a file of `save`, or of `Volume.save` (which stores neither method nor settings).
+        """Read a file that `save` or `Volume.save` has written. (`Volume.save` stores neither method nor settings.)
 
-        Sequences and arrays among the settings become lists. Values that JSON has no type for become text.
+        Sequences and arrays among the settings become lists. Values of a type that JSON does not have become text.
 
         Raises:
             ValueError, KeyError: the file is not an .npz, or another program wrote it.
@@ -414,6 +418,10 @@ class Method(Checked, ABC):
     def for_part(self, share: float, of_time: float) -> Self:
         """The method for a part of a volume. `share` is the fraction of the volume, `of_time` the fraction of the time
         limit."""
+        return self
+
+    def at_height(self, above: float) -> Self:
+        """The method for a part of a volume whose z = 0 lies `above` mm over that of the whole volume."""
         return self
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:

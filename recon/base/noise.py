@@ -15,7 +15,7 @@ from recon.base.geometry import Geometry
 
 NOISE_VIEWS = 16  # number of projections from which the noise is measured
 _LOW, _HIGH = 3, 4  # orders of the differences; the higher order contains finer structure
-_LARGEST_BLUR = 1.5  # pixels
+_LARGEST_BLUR = 1.5  # largest width of a blur in pixels
 _BOW_TIE_ROWS, _BOW_TIE_BINS, _LEAST_POWERS = 32, 16, 200
 _EVEN = 0.02  # tolerance of the angles, as a share of the step between projections
 # number of values and of bins of a histogram; smallest height of a peak, as a share of the highest
@@ -174,7 +174,8 @@ def _first_peak(curve: NDArray[np.float64], height: float, prominence: float) ->
     A curve that begins and ends at its minimum has such a maximum. scipy.signal is not used, because it takes a second
     to load.
     """
-    bounds = np.flatnonzero(np.diff(curve, prepend=np.nan, append=np.nan))  # of runs of equal values
+    # first and last index of runs of equal values
+    bounds = np.flatnonzero(np.diff(curve, prepend=np.nan, append=np.nan))
     for first, last in zip(bounds[:-1], bounds[1:] - 1, strict=True):
         top = curve[first]
         if top < height or first == 0 or last == curve.size - 1 or max(curve[first - 1], curve[last + 1]) > top:

@@ -64,10 +64,17 @@ def part_of(geometry: Geometry, grid: Grid, slices: slice) -> tuple[slice, Geome
     first = min(max(math.floor(z.min() + shifts.min() + _ON_A_ROW), 0), last)
     end = min(max(math.ceil(z.max() + shifts.max() - _ON_A_ROW), first), last) + 1
     views = geometry.rows(first, end)
-    moved = (first + views.axis_row - geometry.axis_row) * geometry.pixel_pitch
+    moved = height_of(slice(first, end), geometry)
     middle = grid.centre[0] + ((slices.start + slices.stop) - grid.shape[0]) / 2 * grid.spacing[0]
     shape, centre = (slices.stop - slices.start, *grid.shape[1:]), (middle - moved, *grid.centre[1:])
     return slice(first, end), views, replace(grid, shape=shape, centre=centre)
+
+
+def height_of(rows: slice, geometry: Geometry) -> float:
+    """How far (mm) z = 0 of the geometry of these rows lies above that of the whole geometry."""
+    return float(
+        (rows.start + geometry.rows(rows.start, rows.stop).axis_row - geometry.axis_row) * geometry.pixel_pitch
+    )
 
 
 def bands_of(geometry: Geometry, grid: Grid) -> list[tuple[slice, Geometry]]:

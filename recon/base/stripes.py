@@ -13,7 +13,7 @@ from recon.base.arrays import F32, median_deviation
 from recon.base.geometry import Geometry
 
 _BLOCKS, _BLOCK = 8, 5
-_RING_VIEWS, _NEIGHBOURS = 20, 9  # projections; pixels along a row
+_RING_VIEWS, _NEIGHBOURS = 20, 9  # fewest projections; number of pixels along a row
 # two limits in standard deviations; smallest number of columns that have a mirrored column
 _SURE, _SHARED, _FEWEST_PAIRS = 3.0, 2.0, 40
 NARROWEST = 64  # least columns; with 40 columns, the methods that remove stripes add larger errors than they remove
@@ -25,7 +25,7 @@ _ONE_SIDED = 0.5
 # number of contiguous blocks of projections; number of projections in the smallest block
 _STEADY_BLOCKS, _STEADY_BLOCK = 8, 8
 AT_AXIS = 4.0  # columns on either side of the axis; a body this small on the axis looks like a ring
-_FEWEST_MIRRORED = 20  # mirrored columns
+_FEWEST_MIRRORED = 20  # smallest number of mirrored columns
 
 
 def ring_offsets(residual: F32, geometry: Geometry) -> F32:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from recon.base.arrays import median_deviation, some_values
 from recon.base.views import spread
 
-HC = 1.239841984e-6  # keV mm: wavelength in mm times photon energy (CODATA 2018)
+HC = 1.239841984e-6  # keV mm: product of wavelength in mm and photon energy (CODATA 2018)
 _TURNS = 10  # fewer turns are plausible in radians, unless all angles are whole numbers
 _FEWEST = 5  # with fewer projections there is no warning
 _ROUND = 0.01  # tolerance, as a share of 360° or 180°

@@ -40,11 +40,12 @@ def geometry_of_vectors(vectors: ArrayLike, detector_shape: tuple[int, int], *, 
     Args:
         vectors: float [view, 12], in mm; see the module.
         detector_shape: (rows, cols) in pixels.
-        cone: True: the first three values are the source. False: they are the direction of the beam (with either sign).
+        cone: True: the first three values are the source; False: the first three values are the direction of the beam
+            (with either sign).
 
     Raises:
-        ValueError: the vectors are not finite [view, 12], or the vectors of a projection do not describe such a
-            detector (square pixels, as above) within `TOLERANCE`.
+        ValueError: the vectors are not finite [view, 12], or the vectors of a projection do not describe a detector
+            with square pixels, as above, within `TOLERANCE`.
     """
     check_arguments(geometry_of_vectors, locals())
     given = np.asarray(vectors, np.float64)

@@ -52,8 +52,8 @@ class Grid:
 
     @classmethod
     def matching(cls, geometry: Geometry) -> Grid:
-        """The grid with one voxel per detector pixel: (rows, cols, cols) voxels around the rotation axis, at their
-        height.
+        """The grid with one voxel per detector pixel: (rows, cols, cols) voxels around the rotation axis. The middle
+        slice is at the height of the middle detector row.
 
         If projections are shifted, the function counts how many projections see each position along the columns and
         along the rows. The grid covers the positions that are seen at least half as often as the position that is seen
@@ -76,8 +76,8 @@ class Grid:
 
         The box includes everything that shifted projections see, and it exists even if the axis is outside the
         detector. Roll and tilt are ignored. The field of view of a cone is measured at the rotation axis. Few
-        projections see material outside this field of view: it is in the beam only at angles at which it is far from
-        the source. The box of a wide cone ends before its source.
+        projections see material outside this field of view: this material is in the beam only at angles at which it is
+        far from the source. The box of a wide cone ends before it reaches the source.
         """
         low, high = geometry.heights
         across, along = 2 * geometry.reach / voxel_size, (high - low) / voxel_size
@@ -90,7 +90,8 @@ class Grid:
     def for_fit(cls, geometry: Geometry, wanted: Grid, *, wider: bool = False) -> Grid:
         """The box that a fit covers: the whole field of view, in voxels of the requested size.
 
-        `wider`: True for a sample that is wider than the field of view. The box is then as wide as the requested box.
+        `wider`: True for a sample that is wider than the field of view. If `wider` is True, the box is as wide as the
+            requested box.
 
         The voxel size is between one and four pixels. Projections resolve nothing finer than a pixel, and a fit cannot
         start from a volume coarser than four pixels.
@@ -111,9 +112,9 @@ class Grid:
         return replace(self, shape=(nz, across, across))
 
     def reaching(self, radius: float, geometry: Geometry) -> Grid:
-        """The box with whole voxels added around the axis until it reaches `radius` in mm from the rotation axis.
+        """A wider box: voxels are added on all four sides until each side is `radius` mm from the rotation axis.
 
-        For a cone beam, the box is limited so that its corners do not reach the source.
+        For a cone beam, the box is limited so that the corners of the box do not reach the source.
         """
         most = geometry.source_distance / math.sqrt(2) - self.voxel_size
         half = np.asarray(self.shape[1:]) * self.voxel_size / 2
@@ -128,7 +129,9 @@ class Grid:
         return replace(self, shape=(self.shape[0], y, x), centre=(self.centre[0], *middle.tolist()))
 
     def as_tall_as_rays(self, geometry: Geometry) -> Grid:
-        """The box with whole slices added until it contains all rays of a cone, which rise or fall to its corners."""
+        """A taller box: slices are added at the top and at the bottom until the box contains every ray of a cone beam.
+        The extra slices are needed because the rays rise or fall on their way to the corners of the box.
+        """
         corner, edge = float(np.hypot(*np.abs(self.edges[:, :2]).max(axis=0))), self.spacing[0]
         # how far the rays of a row rise over this distance
         row = min(corner / geometry.source_distance, 1.0) * geometry.sample_pitch
@@ -159,7 +162,9 @@ class Grid:
         return z, y, x
 
     def part(self, z: slice, y: slice, x: slice) -> Grid:
-        """The box of these voxels; each slice must have a start and a stop."""
+        """The part of this box that contains only the voxels [z, y, x]. Each of the three slices must have a start and
+        a stop.
+        """
         slices = (z, y, x)
         centre = tuple(
             first + (part.start + part.stop - 1) / 2 * edge
@@ -220,8 +225,8 @@ class Volume:
     def save(self, path: str | Path, **facts: object) -> None:
         """Write the volume to the new file `path`, an .npz; `beamline export` converts it.
 
-        Arrays: `volume` float32 [z, y, x] in 1/mm, `voxel_mm`, `slice_mm` (the edge along z), `centre_zyx_mm`, and
-        `facts`. The file is written completely or not at all.
+        The file contains the arrays `volume` float32 [z, y, x] in 1/mm, `voxel_mm`, `slice_mm` (the edge along z),
+            `centre_zyx_mm`, and `facts`. The file is written completely or not at all.
 
         Raises:
             ValueError: the suffix is not .npz.

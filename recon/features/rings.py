@@ -71,10 +71,10 @@ def without_dead_columns(sinogram: F32) -> F32:
 def without_large_stripes(sinogram: F32) -> F32:
     """Shift wide or strong stripes to the level of their neighbours (Vo et al. 2018, algorithm 5, in line integrals).
 
-    A column is changed only if its sorted values differ from those of the columns around it by three times the noise of
-    a pixel. The values must also differ by about the same amount everywhere in their middle four fifths. If a tenth of
-    all columns meet these two conditions, no column is changed. [our own: the second condition; without it, metal near
-    the axis would count as a stripe]
+    A column is changed only if its sorted values differ from those of the columns around it by more than three times
+    the noise of a pixel. The values must also differ by about the same amount everywhere in their middle four fifths.
+    If a tenth of all columns meet these two conditions, no column is changed. [our own: the second condition; without
+    it, metal near the axis would count as a stripe]
     """
     ranked = np.sort(sinogram, axis=0)
     smooth = median_filter(ranked, (1, 2 * width_for(sinogram.shape[1]) + 1), mode="nearest")
@@ -139,8 +139,8 @@ def remove_rings(
     rings: Rings = "auto",
     axis_col: float | None = None,
 ) -> WithoutRings:
-    """A copy of line integrals without the stripes that cause rings. Use it after `recon.correct` and before a
-    reconstruction.
+    """A copy of line integrals without the stripes that cause rings. Call `remove_rings` after `recon.correct` and
+    before a reconstruction.
 
     Args:
         projections: [view, row, col], in any order. The data are not changed if there are fewer than 8 projections

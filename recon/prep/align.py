@@ -33,7 +33,7 @@ _EDGE = 25  # at each edge, one of this many columns is too near to the edge to 
 
 
 def axis_from_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> AxisEstimate:
-    """The rotation axis from two opposite projections. p180 is p0, mirrored about the axis.
+    """The rotation axis from two opposite projections. p180 shows the same as p0, mirrored about the axis.
 
     The normalised correlation of p0 with the mirrored p180 is computed for an axis at every half column, and a parabola
     is fitted to its peak. Mirroring about a half column maps pixels to pixels, so no value is interpolated. The sample
@@ -219,7 +219,7 @@ def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
 def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
     """The rotation axis (centre of rotation) of a scan, from all projections.
 
-    First, all projections are used together. If they show no axis and the scan covers 360°, pairs of opposite
+    First, all projections are used together. If this shows no axis and the scan covers 360°, pairs of opposite
     projections are used, because in half acquisition the axis is near an edge of the detector. In a 180° scan of a
     sample wider than the field of view, the two ends of the scan are used, or a pair of opposite projections.
 
@@ -227,11 +227,12 @@ def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
         projections: float32 [view, row, col], line integrals.
         angles: [view], radians.
 
-    Returns: The estimate from all projections. If this estimate is not confident, but another one (opposite
-    projections, ends, pair) is confident, the other estimate.
+    Returns: The estimate from all projections, if it is confident. If it is not confident: a confident estimate from
+        opposite projections, from the two ends of the scan, or from one pair of projections. If no estimate is
+        confident, the estimate from all projections.
 
     Raises:
-        ValueError, AxisError: as `axis_from_sinogram`.
+        ValueError, AxisError: for the same reasons as `axis_from_sinogram`.
 
     Warns:
         UserWarning: angles look like degrees, or projections look like counts or transmission.

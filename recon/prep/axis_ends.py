@@ -54,9 +54,9 @@ def axis_from_ends(projections: NDArray[np.floating], angles: Floats) -> AxisEst
     totals = {round(2 * share * cols) for share in (0.4, 0.5, 0.6)}
     for total in {round(2 * lowest(*_join(data, each, times)[:2])[0]) for each in totals}:
         candidates, values, errors = _join(data, total, times)
-        at = np.round(_FINER * candidates).astype(int)
+        bins = np.round(_FINER * candidates).astype(int)
         error = float(np.median(errors)) if values.min() < curve.min() else error
-        curve[at] = np.minimum(curve[at], values)
+        curve[bins] = np.minimum(curve[bins], values)
     candidates, curve = np.flatnonzero(np.isfinite(curve)) / _FINER, curve[np.isfinite(curve)]
     value, _ = optimum(candidates, curve)
     rivals = curve[np.abs(candidates - candidates[curve.argmin()]) > cols / _RIVAL]

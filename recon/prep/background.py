@@ -23,7 +23,7 @@ _SMOOTH = 1.5  # voxels; smoothing raises weakly absorbing material above the no
 # limit for material in standard deviations of the smoothed air; number of voxels around material that also count as
 # material
 _SIGMAS, _MARGIN = 5.0, 4
-_CLIPPED = 4.0  # standard deviations
+_CLIPPED = 4.0  # limit in standard deviations
 _BLOCK = 8  # pixels per side of a block; every second block of air is predicted from the other blocks
 # smallest share of rays in air that a projection needs; smallest share of such projections
 _LEAST_AIR, _LEAST_VIEWS = 0.03, 0.9
@@ -95,7 +95,7 @@ def powers(order: int) -> list[tuple[int, int]]:
 
 
 def matter(volume: F32, inside: Mask) -> Mask:
-    """Voxels near material, bool [z, y, x]. Material are the voxels whose smoothed value exceeds the air level by five
+    """Voxels near material, bool [z, y, x]. A voxel is material if its smoothed value exceeds the air level by five
     standard deviations.
 
     Args:

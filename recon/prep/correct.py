@@ -63,8 +63,8 @@ def correct(
     """Line integrals -log((counts - dark) / (flat - dark)) of a stack of projections.
 
     All results are finite: dead pixels and single bad values get the mean of their good neighbours. The result contains
-    their number. In addition to the result, the function needs memory for a few frames. Arguments and errors are those
-    of `survey` and of `CorrectionPlan.transmission`.
+    the number of these pixels and values. In addition to the result, the function needs memory for a few frames.
+    Arguments and errors are those of `survey` and of `CorrectionPlan.transmission`.
     """
     counts = without_mask(counts)
     check_arguments(correct, locals())

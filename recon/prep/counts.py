@@ -48,17 +48,17 @@ class Photons:
 class Counts:
     """Detector counts with the sample, without the sample (flat), and without the beam (dark).
 
-    The model of a pixel (shifted Poisson: Snyder, Hammoud & White 1993, J. Opt. Soc. Am. A 10, 1014; Yavuz & Fessler
-    1998): (counts - dark) / gain + v is Poisson with mean (flat - dark) / gain x e^(-line integral) + v, where v is
-    variance / gain². The model assumes that flat and dark have no noise, because they are means of many frames.
+    The model of a pixel (shifted Poisson: Snyder, Hammoud & White 1993, JOSA A 10, 1014; Yavuz & Fessler 1998): (counts
+    - dark) / gain + v is Poisson with mean (flat - dark) / gain x e^(-line integral) + v, where v is variance / gain².
+    The model assumes that flat and dark have no noise, because they are means of many frames.
 
     Attributes:
         counts: [view, row, col], any real type.
         flat: counts with the beam and without the sample, [row, col] or [view, row, col].
         dark: counts without the beam, a number or [row, col].
         gain: camera gain, counts per photon, see `photon_transfer`.
-        variance: variance of a pixel in one dark frame, counts², a number or [row, col]. Its causes are the readout,
-            and photons that carry no information about the sample.
+        variance: variance of a pixel in one dark frame, counts², a number or [row, col]. The variance comes from the
+            readout, and from photons that carry no information about the sample.
     """
 
     counts: ArrayLike
@@ -90,10 +90,11 @@ class Counts:
             )
 
     def photons(self, view: int) -> tuple[F64, F64, F64]:
-        """Three images [row, col] of a projection: photons counted plus v, photons without the sample plus v, and v.
+        """Three images [row, col] of a projection: the counted photons plus v, the photons without the sample plus v,
+        and v. Here v is the variance of a dark frame in units of photons², see `Counts`.
 
-        If the flat of a pixel is not above its dark, its photons without the sample are 0. Counts that are NaN stay
-        NaN.
+        If the flat of a pixel is not above the dark, the photons without the sample are 0. If the counts of a pixel are
+        NaN, its photons are NaN.
         """
         dark = np.asarray(self.dark, np.float64)
         flat = np.asarray(self.flat)
@@ -181,8 +182,9 @@ def _expected(n: F64, beam: F64, extra: F64) -> tuple[F64, F64]:
     """Photons expected in each pixel [row, col], above 0. They are the counts, smoothed everywhere or only where they
     show no detail."""
     mean = _smooth(n, _SIGMA) / np.maximum(_smooth(beam, _SIGMA), 1e-12) * beam
-    left = 1 - 0.75 / (np.pi * _SIGMA**2)  # share of the variance of white noise in n - mean: 1 - 2 / 2πσ² + 1 / 4πσ²
-    variance = _smooth((n - mean) ** 2, _SPREAD) / left
+    # share of the variance of white noise in n - mean: 1 - 2 / 2πσ² + 1 / 4πσ²
+    noise_share = 1 - 0.75 / (np.pi * _SIGMA**2)
+    variance = _smooth((n - mean) ** 2, _SPREAD) / noise_share
     counting = _smooth(n + extra, _SPREAD)
     detail = np.clip(1 - _DETAIL * counting / np.maximum(variance, 1e-12), 0, 1)
     return np.maximum(mean + detail * (n - mean), _FEWEST), np.maximum(mean, _FEWEST)

@@ -41,13 +41,13 @@ class CorrectionSettings:
     """Settings of the correction from counts to line integrals.
 
     Attributes:
-        floor: lowest transmission. A lower transmission (also zero or a negative one) is replaced by the floor, so its
-            line integral is -log(floor).
+        floor: lowest transmission. A transmission below the floor, including zero and negative values, is replaced by
+            the floor; the line integral is then -log(floor).
         hot_threshold: limit in robust standard deviations. A pixel is masked if its dark, or its response to the beam,
-            differs from its neighbours by more. inf: no pixel is masked.
+            differs from its neighbours by more than `hot_threshold`; with inf, no pixel is masked.
         zinger_threshold: limit in standard deviations. A pixel is a zinger if it exceeds both its surroundings and the
-            same pixel in the neighbouring projections by this limit, see `recon.prep.spots.spots`. inf: no zinger is
-            removed.
+            same pixel in the neighbouring projections by this limit, see `recon.prep.spots.spots`; with inf, no zinger
+            is removed.
         air: number of columns (left, right) that see no sample in any projection, or "auto" to find them, or "none".
             Each projection is divided by the level of its air columns. If both sides have air columns, the projection
             is divided by a straight line between the levels of the left and the right side.

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
 
-_FEWEST = 4  # flats
-_MOST = 10  # components
+_FEWEST = 4  # smallest number of flats
+_MOST = 10  # largest number of components
 _RANDOM = 10  # number of random draws of the parallel analysis
 _SAMPLED = 1 << 16  # number of pixels used for the components, and for the weights of a projection
 _APART = 4  # distance in pixels for differences; the beam changes more slowly than noise

@@ -44,5 +44,5 @@ def fans_shown(sinogram: F64, angles: F64, axis_col: float, slope: float) -> tup
         return float(np.square(rows - np.stack(there, axis=1)).mean() / (2 * rows.var()))
 
     slopes = np.tan(np.arange(0, _WIDEST, _STEP)) / u[-1]
-    found = [disagreement(each) for each in slopes]
-    return disagreement(slope), min(found), float(np.median(found)), float(slopes[int(np.argmin(found))])
+    mismatches = [disagreement(each) for each in slopes]
+    return disagreement(slope), min(mismatches), float(np.median(mismatches)), float(slopes[int(np.argmin(mismatches))])

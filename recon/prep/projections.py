@@ -22,14 +22,14 @@ class Projections:
         view_ids: int64 [view].
         floored: fraction of the values of live pixels whose transmission was below the lowest allowed value, and was
             set to this value.
-        air: float32 [view], mean transmission of the air columns in each projection. The projection was divided by it.
-            1: there are no air columns.
+        air: float32 [view], mean transmission of the air columns in each projection. The projection was divided by this
+            transmission; it is 1 if there are no air columns.
         masked: bool [row, col], dead and hot pixels, filled from their neighbours in every projection.
-        air_columns: (left, right) number of columns in which `air` was measured. (0, 0): `air` was not measured.
+        air_columns: (left, right) number of columns in which `air` was measured; (0, 0) if `air` was not measured.
         replaced: fraction of all values of live pixels that were zingers or not finite, and were filled from their
             neighbours.
         weights: float32 [view, row, col], inverse variances of the line integrals, from the expected photons; 0 for
-            masked pixels. None: photons were not counted.
+            masked pixels; None if photons were not counted.
         unmeasured: int64 [run, 4], runs of pixels without data in one projection, which were filled from their
             neighbours. The four numbers are the projection, the row, the first column, and the column after the last.
         spots_left: number of pixels in zingers that were too large to be filled, in these projections and all earlier
@@ -49,8 +49,9 @@ class Projections:
 
     @property
     def lit(self) -> Mask | None:
-        """bool [view, row, col], True for pixels with data. None: all pixels have data. (Interpolated single lines
-        count as data.)"""
+        """bool [view, row, col], True for pixels with data; None if all pixels have data. (Interpolated single lines
+        count as data.)
+        """
         lit = np.repeat(~areas(self.masked)[None], len(self.data), axis=0)
         index_of = {int(view): number for number, view in enumerate(self.view_ids)}
         for view, row, first, end in self.unmeasured[np.isin(self.unmeasured[:, 0], self.view_ids)].tolist():

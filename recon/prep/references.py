@@ -27,17 +27,17 @@ Kept = TypeVar("Kept", F32, F64)
 class References:
     """Darks (images without beam) and flats (images with beam but without sample).
 
-    A stack of frames [frame, row, col], any real type, is replaced by its mean. Zingers of single frames do not enter
-    the mean.
+    If darks or flats are a stack of frames [frame, row, col] of any real type, the stack is replaced by the mean of its
+    frames. Zingers of single frames do not enter the mean.
 
     Attributes:
         dark: float32 [row, col], mean or median of the darks; or all darks as a stack.
         flats: (position, float32 [row, col]) of each group of flats, or (position, stack). The position is the number
             of the frame in the scan.
-        dynamic: components of the differences between flats, from which the flat of each projection is computed. None:
-            the flat of a projection is interpolated between groups of flats.
+        dynamic: components of the differences between flats, from which the flat of each projection is computed; None
+            if the flat of a projection is interpolated between groups of flats.
         part_starts: the first frame of each part of the scan, ascending. The flat of a projection is computed from the
-            flats of its own part. If its part has no flats, the nearest group of flats is used.
+            flats of the same part. If this part has no flats, the nearest group of flats is used.
     """
 
     dark: Image
@@ -183,8 +183,8 @@ def shadowed(transmission: NDArray[np.float32], floor: float = 1e-4) -> Mask:
     block = np.ones((3, 3))
     dark = ndimage.binary_opening(ndimage.binary_closing(np.pad(dark, 2, mode="edge"), block), block)[2:-2, 2:-2]
     left, right = (np.logical_and.accumulate(side, axis=1) for side in (dark, dark[:, ::-1]))
-    found = left | right[:, ::-1]
-    return with_rim(found, bright) | whole[:, None]
+    shadow = left | right[:, ::-1]
+    return with_rim(shadow, bright) | whole[:, None]
 
 
 _NEXT, _OUTER = 5, 3  # number of projections next to flats; number of columns
@@ -265,7 +265,7 @@ def air_light(transmission: F32, left: int, right: int) -> F32:
     changed its shape since the flat.
     """
     views, _, cols = transmission.shape
-    sides = [(side, at) for side, at in (
+    sides = [(side, middle) for side, middle in (
         (transmission[:, :, :left], (left - 1) / 2), (transmission[:, :, cols - right :], cols - (right + 1) / 2),
     ) if side.shape[2]]  # fmt: skip
     if not (sides and views):
@@ -273,6 +273,6 @@ def air_light(transmission: F32, left: int, right: int) -> F32:
     levels = [np.median(side, axis=(1, 2)).astype(np.float32) for side, _ in sides]
     if len(sides) == 1:
         return np.repeat(levels[0][:, None], cols, axis=1)
-    first, last = (at for _, at in sides)
+    first, last = (middle for _, middle in sides)
     along = np.clip((np.arange(cols) - first) / (last - first), 0, 1).astype(np.float32)
     return levels[0][:, None] * (1 - along) + levels[1][:, None] * along

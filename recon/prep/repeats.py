@@ -19,7 +19,7 @@ _SMOOTH, _EDGE = 1.5, 2  # standard deviation of the smoothing, and width that i
 # limits for the distance in pixels between two rays at the edge of the field of view; beyond the second value the
 # difference is not linear
 _EXACT, _LINEAR = 0.1, 2.3
-# the two projections of a pair are at least one part in _LATER of the scan apart, and at least this share of the
+# the two projections of a pair must be at least one part in _LATER of the scan apart, and at least this share of the
 # longest time in any pair
 _LATER, _LONGEST = 3, 0.9
 # largest number of projections for which pairs are searched; number of pairs; number of bands of rows, which are

@@ -16,7 +16,7 @@ from recon.base.registry import LibraryError, loaded
 if TYPE_CHECKING:
     from torch import Tensor
 
-_FAINTEST = 1e-30  # density units
+_FAINTEST = 1e-30  # smallest density, in density units
 _PARAMETERS = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "raw_densities": ()}
 
 
@@ -31,8 +31,8 @@ class Gaussians:
         log_scales: [n, 3], logarithms of standard deviations in mm along the Gaussian's own axes.
         quaternions: [n, 4] (w, x, y, z), rotations; their length need not be 1, but must not be 0.
         raw_densities: [n]; ρ = density_unit * softplus(raw), so a density is never negative.
-        density_unit: a typical density in 1/mm. Raw values refer to densities divided by this unit, so raw values and
-            their learning rates do not depend on the units of the data.
+        density_unit: a typical density in 1/mm. Raw densities describe multiples of this density. Therefore raw
+            densities and their learning rates are the same in any unit of length.
         kernel: radial profile f.
     """
 
@@ -109,7 +109,7 @@ class Gaussians:
         return replace(self, **some)
 
     def widened(self, variance: float) -> Gaussians:
-        """The same Gaussians, widened by adding `variance` (mm²) in every direction. Their mass stays the same."""
+        """The same Gaussians, widened by adding `variance` (mm²) in every direction. Each Gaussian keeps its mass."""
         import torch
 
         if variance <= 0:

@@ -48,7 +48,7 @@ _PUBLISHED_SHARE, _PUBLISHED_LEAST = 0.15, 0.0005
 
 SCALED_BY = 12  # number of projections from which the scale of the densities is computed
 _SLOPE_SIGMA = 1.0  # standard deviation, in voxels, of the Gaussian for gradients
-_LEAST_JOINED = 4  # pixels
+_LEAST_JOINED = 4  # fewest rows after binning
 _MIDDLE = 8  # slices on each side of the middle whose changes are measured
 
 

@@ -36,18 +36,18 @@ class R2(Fit):
     """R²-Gaussian fit: fits a sum of Gaussians to the projections (Zha et al. 2024, with refinements).
 
     Attributes:
-        steps: number of steps. 0: the result is the starting point. None: 400 steps; if `seconds` is given, as many
+        steps: number of steps; 0: the result is the starting point; None: 400 steps, or, if `seconds` is given, as many
             steps as the time allows.
         seconds: time limit of the whole run by the caller's clock: start, steps, voxel refinement and volume. The
             learning rates decay over this time. If `warm_up` was not called, the compilation of kernels counts, too.
             The fit always makes its start and its first step, even if the time is too short.
-        gaussians: number of Gaussians at the start, or the Gaussians to start from. None: a number derived from the
+        gaussians: number of Gaussians at the start, or the Gaussians to start from; None: a number derived from the
             detector.
         start: volume from which the first Gaussians are sampled, see `initialise.first_volume`.
         early_stop: stop the fit when the residual in held-out projections no longer falls, and return the model with
             the lowest residual.
-        finish: iterations of the voxel refinement after the fit, see `finish.finish`. None: 8 iterations, and after
-            them discrete levels, or steps of PnP-DCT, if one of these predicts held-out projections better.
+        finish: iterations of the voxel refinement after the fit, see `finish.finish`. If `finish` is None, there are 8
+            iterations; discrete levels or steps of PnP-DCT follow if one of these predicts held-out projections better.
             `Reconstruction.gaussians` is the fitted model in every case.
         allow_negative: True: the voxel refinement keeps voxels below zero. (Gaussians are never negative.)
         fit: weights, learning rates and limits.
@@ -103,7 +103,7 @@ class R2(Fit):
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
         """A fit that takes projections during a scan, and starts with `gaussians` Gaussians.
 
-        The fit has the settings `WHILE_VIEWS_COME`. Values of `fit` that differ from the defaults replace them.
+        The fit has the settings `WHILE_VIEWS_COME`, except for values of `fit` that differ from the defaults.
 
         Raises:
             ValueError: as for `StreamingFit`, or `gaussians` is a model instead of a number.
@@ -113,8 +113,9 @@ class R2(Fit):
         return StreamingFit(template, seed=seed, gaussians=self.gaussians, settings=while_views_come(self.fit), now=now)
 
     def for_part(self, share: float, of_time: float) -> Self:
-        """The fit for a part of a volume. It has the fraction `share` of the Gaussians and the fraction `of_time` of
-        the time limit."""
+        """The same method for a part of a volume, with the fraction `share` of the Gaussians and the fraction `of_time`
+        of the time limit.
+        """
         count, seconds = self.gaussians, self.seconds
         return replace(
             self,

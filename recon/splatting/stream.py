@@ -94,11 +94,12 @@ class StreamingFit:
 
     @property
     def started(self) -> bool:
-        """True if the fit has a model. It has no model as long as there are too few projections."""
+        """True if the fit has a model. There is no model as long as there are too few projections."""
         return isinstance(self._stage, Growing)
 
     def add_views(self, data: F32, angles: ArrayLike) -> None:
-        """Add line integrals [k, row, col] at angles [k] in radians; they are used from the next step on.
+        """Add line integrals [k, row, col] at angles [k] in radians. The fit uses the new projections from the next
+        step on.
 
         Pixels without data are NaN and get weight 0.
 
@@ -119,8 +120,8 @@ class StreamingFit:
             self.unlearnt = _running_mean(self.unlearnt, *self._stage.newest(self.settings))
 
     def newest_view(self) -> tuple[F32, F32]:
-        """The newest projection as measured, and as computed from the model: two arrays of line integrals [row, col].
-        In pixels without data both are equal.
+        """Two arrays of line integrals [row, col]: the newest projection as it was measured, and the same projection
+        computed from the model. In pixels without data both are equal.
 
         Raises:
             ValueError: there is no model yet.
@@ -133,9 +134,9 @@ class StreamingFit:
         """Replace the line integrals [view, row, col] of all projections so far, in order, after a changed correction.
 
         If the new data differ by more than a fifth (norm) from the data with which the Gaussians were placed, the
-        Gaussians are placed again. Otherwise the model is kept. `kept` are the numbers, in order, of the projections to
-        which these data belong. If `kept` is given, the fit drops all other projections. The learning rates then start
-        again from their first values, because the model was fitted to bad projections.
+        Gaussians are placed again. If the new data differ by less, the model is kept. `kept` are the numbers, in order,
+        of the projections to which these data belong. If `kept` is given, the fit drops all other projections. The
+        learning rates then start again from their first values, because the model was fitted to bad projections.
 
         Raises:
             ValueError: as for `add_views`, or there are no projections; nothing is changed.
@@ -189,19 +190,19 @@ class StreamingFit:
 
     @property
     def last_steps(self) -> int:
-        """Number of steps of the final fit. Together with the steps during the scan, they make up a fit to all
-        projections at once.
+        """Number of steps of the final fit. The steps during the scan and the final steps together are as many as in a
+        fit of the finished scan.
 
-        The number is at least one step per projection, and never more than in a fit of the finished scan. A fit that
-        was too slow during the scan therefore catches up in the final fit.
+        The final fit uses each projection at least once, and it never has more steps than a fit of the finished scan.
+        If the fit was too slow during the scan, the final fit makes the missing steps.
         """
         each_view_once = math.ceil(self.n_views / self.settings.views_per_step)
         taken = self._stage.state.step if isinstance(self._stage, Growing) else 0
         return min(DEFAULT_STEPS, max(each_view_once, DEFAULT_STEPS - taken))
 
     def finish(self, seconds: float = math.inf, on_progress: Callable[[Progress], bool] | None = None) -> Progress:
-        """Make the final fit to all projections after the scan. It has `last_steps` steps; a time limit of about
-        `seconds` s may end it earlier.
+        """Make the final fit to all projections after the scan. The final fit has `last_steps` steps; a time limit of
+        about `seconds` s may end it earlier.
 
         The rates decay until the end of the final fit. Density control continues in the first half. `on_progress` is
         called about ten times a second; if it returns True, the fit ends.

@@ -78,7 +78,7 @@ class Waiting:
         return Waiting(views, tuple(images), self.rng)
 
     def about(self, axis_col: float) -> Waiting:
-        """With the rotation axis at another column."""
+        """The state with the rotation axis at another column."""
         return replace(self, views=self.views.about(axis_col))
 
     def next_round(self, plan: StreamPlan) -> Waiting | Growing:
@@ -147,7 +147,7 @@ class Growing:
         return cls(views, first.problem, first.state, first.state.n)
 
     def followed_by(self, images: F32, angles: F64) -> Growing:
-        """With new projections [view, row, col]; a projection is used in the first step after its arrival.
+        """The state with new projections [view, row, col]. A projection is used in the first step after its arrival.
 
         Raises:
             ValueError: a projection has no usable value.

@@ -1,5 +1,5 @@
-"""Samples beyond the field of view: measures how far they reach (the only place that does), and reconstructs a box
-that contains all of them.
+"""Samples that are wider than the field of view: measures how far a sample reaches (only this module does), and
+reconstructs a box that contains all of it.
 
 Each projection also contains material outside the field of view. A box of the field alone would put this material at
 its rim and make the middle too dense. So voxels or Gaussians cover the whole sample, and only the part in the field of
@@ -40,10 +40,10 @@ from recon.voxels.methods import EarlyTv
 from recon.voxels.projector import Projector
 from recon.voxels.residuals import residuals_of
 
-# test reconstruction: columns and rows after binning, projections, iterations
+# test reconstruction: largest number of columns and of rows after binning, of projections, and of iterations
 _COLS, _ROWS, _VIEWS, _SWEEPS = 48, 4, 96, 16
-_LOOKS = 8  # number of projections from which rows are chosen
-_ROWS_FROM = 32  # projections whose mean shows the rows that end in material
+_LOOKS = 8  # number of projections from which the rows are chosen
+_ROWS_FROM = 32  # number of projections whose mean shows the rows in which the sample ends
 # ratios between radii in the first and in the second search; largest radius / field of view
 _STEP, _FINE, _WIDEST = 1.2, 1.2 ** (1 / 4), 4.5
 
@@ -96,7 +96,7 @@ class _Outside:
 
 
 def reach_of(views: Views) -> Reach:
-    """How far the sample reaches, as the projections state it; if they do not, it is measured, without the radius."""
+    """How far the sample reaches. If the projections do not state it, it is measured, except for the radius."""
     return views.reach or Reach(edges_of(views), _is_tall(views))
 
 
@@ -117,7 +117,7 @@ def whole_reach(views: Views, given: float | SampleRadius | None = None) -> Reac
 
 
 def _is_tall(views: Views) -> bool:
-    """Whether the sample continues above or below the slices of a cone, where the rays of its rows also cross it.
+    """Whether the sample continues above or below the slices of a cone beam, so that rays also cross it there.
 
     Values that are not finite do not count.
     """
@@ -125,8 +125,8 @@ def _is_tall(views: Views) -> bool:
     if not geometry.is_cone or not len(data) or geometry.is_fan:
         return False
     if geometry.climbs:  # a sample that ends within the heights of a helix fills the rows in most projections
-        at = geometry.offsets[:, 1]
-        lowest, highest = np.nan_to_num(data[[at.argmax(), at.argmin()]], posinf=0, neginf=0).mean(axis=2)
+        heights = geometry.offsets[:, 1]
+        lowest, highest = np.nan_to_num(data[[heights.argmax(), heights.argmin()]], posinf=0, neginf=0).mean(axis=2)
         return bool(ends_in_matter(lowest[None])[0, 0] or ends_in_matter(highest[None])[0, 1])
     rows = np.nan_to_num(data[spread(np.arange(len(data)), _ROWS_FROM)], posinf=0, neginf=0).mean(axis=(0, 2))
     return bool(ends_in_matter(rows[None]).any())
@@ -158,15 +158,15 @@ def _radius_of(views: Views) -> SampleRadius | None:
 
 
 def offset_error(volume: Volume, geometry: Geometry, sample: SampleRadius | None) -> float:
-    """The square error, in 1/mm², in the middle of the field of view, because the density outside it is unknown.
+    """The square error, in 1/mm², in the middle of the field of view that results from the unknown density outside it.
 
-    It is computed from the uncertainty of the density in a box as wide as the sample. For cans of packed balls that are
-    1.5, 2 and 3 times as wide as the field of view, 90 projections give 6 to 20, 1 and 2 times the true value; 30
-    projections give a tenth of it.
+    It is computed from the uncertainty of the density in a box as wide as the sample. Test with cans of packed balls:
+    with 90 projections the result is 6 to 20 times the true value if the can is 1.5 times as wide as the field of view,
+    and 1 and 2 times the true value for 2 and 3 times the width. With 30 projections it is a tenth of the true value.
 
     Args:
         geometry: the geometry of the projections.
-        sample: its radius; None: the sample is within the field of view.
+        sample: radius of the sample; None: the sample is within the field of view.
     """
     return 0.0 if sample is None else (sample.density * _middle_density(volume, geometry.reach)) ** 2
 

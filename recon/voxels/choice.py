@@ -1,4 +1,4 @@
-"""Choice: which candidate predicts held-out projections best, and which strength of a prior does.
+"""Chooses the candidate, or the strength of a prior, that predicts held-out projections best.
 
 Candidates are compared projection by projection, because projections differ more than candidates do. The choice is the
 simplest candidate that the best one does not beat by more than one standard error. For strengths, the choice is the one
@@ -18,15 +18,16 @@ from recon.base.arrays import F64
 from recon.base.decisions import Prior
 
 LEAST_GAIN = 0.02
-"""Share by which a costlier candidate must lower the residual.
+"""Share by which a costlier candidate must lower the residual to be chosen.
 
-(A fit of a tooth lowers it by 1.3 %, in four times the time.)
+(On a scan of a tooth, a fit lowers the residual by 1.3 % and takes four times as long.)
 """
 
-# the measure in the explanation of a choice
+# name of the measure in the explanation of a choice
 _MEASURE = "root mean square residual in held-out projections, as line integrals"
-_ERRORS = 1.0  # standard errors of the difference up to which two candidates count as equally good
-_OCTAVES = 10  # most octaves from the first strength: cones with coarse voxels need 6 to 9, and 40 change nothing
+_ERRORS = 1.0  # standard errors of the difference; below it, two candidates count as equally good
+# largest number of octaves from the first strength: cones with coarse voxels need 6 to 9, and 40 change nothing
+_OCTAVES = 10
 TRIALS = 4
 """Usual number of tests to choose a strength (3 to 6 on five scans).
 
@@ -39,7 +40,8 @@ MOST_TRIALS = (2 + _OCTAVES) / TRIALS
 def exceeds_standard_error(gains: F64, errors: float) -> bool:
     """Whether the mean gain [held-out view] exceeds `errors` of its standard errors.
 
-    False if a gain is not finite, because a candidate was stopped or diverged."""
+    False if a gain is not finite because a candidate was stopped or diverged.
+    """
     return bool(np.isfinite(gains).all()) and float(gains.mean()) > errors * _standard_error(gains)
 
 
@@ -65,8 +67,9 @@ class Prediction(NamedTuple):
     Attributes:
         name: name of the candidate.
         residuals: [held-out view] root mean square, as line integrals; None: the candidate was not tried.
-        prior: the prior of its volume, also for the volume from all projections; None: it has none, or chooses again.
-        remark: why it was not tried, or was stopped early; may be empty.
+        prior: the prior of the candidate's volume, which is used again for the volume from all projections. None: the
+            candidate has no prior, or chooses it again.
+        remark: the reason why the candidate was not tried or was stopped early; may be empty.
     """
 
     name: str
@@ -90,9 +93,9 @@ class TrialChoice(NamedTuple):
 
     @classmethod
     def of(cls, values: Sequence[Any]) -> TrialChoice:
-        """A choice, or its values from a file (see `Decisions`)."""
+        """Convert a choice, or its values from a file (see `Decisions`), to a choice."""
         where, least_gain, predictions = values
-        named = ((name, left, prior and Prior.of(prior), remark) for name, left, prior, remark in predictions)
+        named = ((name, residuals, prior and Prior.of(prior), remark) for name, residuals, prior, remark in predictions)
         return cls(where, least_gain, tuple(Prediction(*each) for each in named))
 
     def after(self, prediction: Prediction) -> TrialChoice:
@@ -105,14 +108,14 @@ class TrialChoice(NamedTuple):
 
         A candidate whose residual is not finite was stopped or diverged, and counts as not tried.
         """
-        given = {at: each.residuals for at, each in enumerate(self.predictions) if each.residuals is not None}
-        return {at: np.asarray(left) for at, left in given.items() if np.isfinite(left).all()}
+        given = {number: each.residuals for number, each in enumerate(self.predictions) if each.residuals is not None}
+        return {number: np.asarray(residuals) for number, residuals in given.items() if np.isfinite(residuals).all()}
 
     @property
     def best(self) -> int | None:
         """Number of the candidate with the smallest mean residual; None: no candidate was tried."""
         tried = self.tried
-        return min(tried, key=lambda at: float(tried[at].mean()), default=None)
+        return min(tried, key=lambda number: float(tried[number].mean()), default=None)
 
     @property
     def least(self) -> F64 | None:
@@ -123,7 +126,8 @@ class TrialChoice(NamedTuple):
     def few_materials(self) -> bool:
         """Whether discrete levels predict held-out projections better than total variation.
 
-        If so, costlier candidates are not tried, to save time, because they do not use levels."""
+        In this case costlier candidates are not tried, to save time: they do not use levels.
+        """
         return any(each.prior and each.prior.materials and each.prior.materials.levels for each in self.predictions)
 
     @property
@@ -131,7 +135,9 @@ class TrialChoice(NamedTuple):
         """Number of the simplest candidate that the best one does not beat significantly; None: none was tried."""
         if (least := self.least) is None:
             return None
-        return next(at for at, each in self.tried.items() if not significantly_better(least, each, self.least_gain))
+        return next(
+            number for number, each in self.tried.items() if not significantly_better(least, each, self.least_gain)
+        )
 
     @property
     def verdicts(self) -> list[str]:
@@ -141,8 +147,8 @@ class TrialChoice(NamedTuple):
         tried, least, words = self.tried, self.least, [""] * len(self.predictions)
         if least is None or all((1 - self.least_gain) * each.mean() <= least.mean() for each in tried.values()):
             return words
-        for at, each in tried.items():
-            words[at] = "best" if at == self.best else "alike" * predicts_as_well(each, least)
+        for number, each in tried.items():
+            words[number] = "best" if number == self.best else "alike" * predicts_as_well(each, least)
         return words
 
     @property
@@ -154,7 +160,9 @@ class TrialChoice(NamedTuple):
     def reason(self) -> str:
         """The part of the scan, all residuals, the remarks, and why a simpler candidate than the best was chosen.
 
-        These residuals are of weighted rays; the data residual elsewhere is a share of the projections."""
+        These residuals are those of weighted rays. The data residual in reports is something else: a share of the norm
+        of the projections.
+        """
         if self.at is None:
             return self.where
         given = [(each.name, np.mean(each.residuals)) for each in self.predictions if each.residuals is not None]
@@ -168,7 +176,7 @@ class TrialChoice(NamedTuple):
         if self.at is None or self.best is None or self.at == self.best:
             return ""
         (simple, of_simple), (best, of_best) = (
-            (self.predictions[at].name, self.tried[at]) for at in (self.at, self.best)
+            (self.predictions[number].name, self.tried[number]) for number in (self.at, self.best)
         )
         improvement, error = (
             (of_simple - of_best).mean() / of_simple.mean(),
@@ -213,13 +221,13 @@ def preferred_strength(residuals_of: Callable[[float], F64], first: float) -> Be
     if math.isinf(mean(1)) or math.isinf(mean(0)):
         return None
     up = not exceeds_standard_error(tried[1] - tried[0], _ERRORS)
-    at, towards = (1, 1) if up else (0, -1)
-    while abs(at + towards) <= _OCTAVES:
-        if math.isinf(mean(at + towards)):
+    place, towards = (1, 1) if up else (0, -1)
+    while abs(place + towards) <= _OCTAVES:
+        if math.isinf(mean(place + towards)):
             return None
-        if exceeds_standard_error(tried[at + towards] - tried[at], _ERRORS if up else 0.0):
+        if exceeds_standard_error(tried[place + towards] - tried[place], _ERRORS if up else 0.0):
             break
-        at += towards
+        place += towards
     octave = min(tried, key=mean)
     vertex = float(octave)
     if octave - 1 in tried and octave + 1 in tried:

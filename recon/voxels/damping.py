@@ -28,12 +28,12 @@ from recon.voxels.devices import VoxelDevice, projector_on, voxel_device
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import one_of_like_rows
 
-_CELLS = 64  # most cells along the longer side; finer detail is not damped
-_UNDAMPED, _MOST = 2.0, 32.0  # cycles a side from which steps are longer; the largest gain
+_CELLS = 64  # largest number of cells along the longer side; finer detail is not damped
+_UNDAMPED, _MOST = 2.0, 32.0  # cycles per side, above which steps are longer; the largest gain
 _GAIN_A_VIEW = 2 / 3  # longer steps for detail that the projections do not resolve would only add noise
-_LEAST_OF_TENTS = 0.2  # smallest share of a wave left by the tents that is still compensated
-_LANCZOS_STEPS, _MARGIN = 8, 1.1  # factor, because Lanczos' estimate is too low
-_NOTHING = 1e-6  # rounding error
+_LEAST_OF_TENTS = 0.2  # smallest share of a wave that remains in the tents and is still compensated
+_LANCZOS_STEPS, _MARGIN = 8, 1.1  # safety factor, because Lanczos' estimate is too low
+_NOTHING = 1e-6  # size of the rounding error
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ class Damping:
         ]
         side = max(rows, cols)
         cycles = np.hypot(down[:, None] * side / rows, across[None] * side / cols)
-        left = 1 - np.clip(cycles / _UNDAMPED, 1, self.gain) / self.gain
-        left = np.minimum(left / (kept[0][:, None] * kept[1][None]), 1 - 1 / self.gain)  # L must stay below 1
-        return (left / self.width**2).astype(np.float32)
+        transfer = 1 - np.clip(cycles / _UNDAMPED, 1, self.gain) / self.gain
+        transfer = np.minimum(transfer / (kept[0][:, None] * kept[1][None]), 1 - 1 / self.gain)  # L must stay below 1
+        return (transfer / self.width**2).astype(np.float32)
 
     def cells(self, device: VoxelDevice[Any], x: Any) -> Any:
         """The sums of a volume [y, x, z] in coarse cells, on which L acts."""
@@ -87,9 +87,9 @@ class Damping:
 def largest_damped(projector: Projector, weight: F32 | None, damping: Damping) -> float:
     """An upper estimate of the largest eigenvalue of gain (1 - L) AᵀWA, by Lanczos steps from noise.
 
-    It is the eigenvalue of the symmetric √W A gain (1 - L) Aᵀ √W. If all rows are alike, it is computed on one of them.
-    (Lanczos 1950, J. Res. Natl. Bur. Stand. 45, 255; from a random vector: Kuczyński & Woźniakowski 1992, SIAM J.
-    Matrix Anal. Appl. 13, 1094.)
+    It is also an eigenvalue of the symmetric matrix √W A gain (1 - L) Aᵀ √W. If all rows are equivalent, it is computed
+    on one row. (Lanczos 1950, J. Res. Natl. Bur. Stand. 45, 255; from a random vector: Kuczyński & Woźniakowski 1992,
+    SIAM J. Matrix Anal. Appl. 13, 1094.)
     """
     device = voxel_device(projector.device)
     plain = one_of_like_rows(projector.plain, weight)

@@ -337,7 +337,9 @@ class Fbp(Direct):
         return Reconstruction(Volume(data, problem.grid), {"filter": self.filter})
 
     def views_wanted(self, geometry: Geometry) -> NDArray[np.bool_]:
-        """All except laterally offset projections. ValueError for a cone beam that FDK cannot use."""
+        """True for all projections except laterally offset ones. Raises ValueError for a cone beam that FDK cannot
+        use.
+        """
         if geometry.is_cone and missing_arc(geometry) > 0:
             cone_weights(geometry)  # the error says how many degrees are missing
         return super().views_wanted(geometry)

@@ -29,15 +29,17 @@ F32 = NDArray[np.float32]
 Parts = NDArray[np.integer]
 
 SWEEPS = 10
-# columns; residuals are relative to means of this width, because effects of air and outside material are smooth
+# columns over which a mean is taken. Residuals are relative to this mean, because effects of air and of outside
+# material are smooth.
 SMOOTH = 8.0
-NEAR = math.radians(5)  # radians from a projection of the longest part; farther projections are hardly predicted
+# radians from the nearest projection of the longest part; farther projections cannot be predicted
+NEAR = math.radians(5)
 TRIAL = 0.25  # pixels; step of the sample for numerical derivatives
 FARTHEST = 4.0  # largest step in pixels
-RELAXED = 1.5  # factor on a step, because the corrected projections are also in the volume, which makes steps too small
+RELAXED = 1.5  # factor on a step: the corrected projections are also in the volume, so steps come out too small
 _NO_TRIALS = GoesOn(trials=GoesOn(lambda *_: False))
-_STEPS = 4  # steps of the first registration
-_MEASURED = 0.99  # least weight of measured pixels in an interpolated one
+_STEPS = 4  # number of steps of the first registration
+_MEASURED = 0.99  # least share of measured pixels in an interpolated pixel
 
 
 @dataclass(frozen=True)
@@ -110,10 +112,10 @@ def unmagnified(images: F32, factor: float, centre: tuple[float, float], order: 
     """
     if factor == 1:
         return images
-    scale, made = np.full(2, factor), np.empty_like(images)
+    scale, resampled = np.full(2, factor), np.empty_like(images)
     for view, image in enumerate(images):
-        affine_transform(image, scale, (1 - scale) * centre, output=made[view], order=order)
-    return made
+        affine_transform(image, scale, (1 - scale) * centre, output=resampled[view], order=order)
+    return resampled
 
 
 def measured_unmagnified(there: NDArray[np.bool_], factor: float, centre: tuple[float, float]) -> NDArray[np.bool_]:
@@ -132,8 +134,8 @@ def displacements(
 ) -> list[Displacement]:
     """The displacement of each part relative to the longest one.
 
-    The precision is about 0.1 pixel if the material has edges. Motion by more than a tenth of the field of view, or
-    with deformation, is not found, see `judge`.
+    The precision is about 0.1 pixel if the material has edges. Motion is not found if it exceeds a tenth of the field
+    of view, or if the sample deforms; see `judge`.
 
     Args:
         projections: [view, row, col], line integrals.
@@ -180,8 +182,8 @@ def judge(
     alone = problem.volume(moves, used[parts[used] == problem.longest])
 
     def deviations(volume: Volume) -> NDArray[np.float64]:
-        left, weight = problem.residual(volume, moves, held)
-        return np.sqrt((left**2).sum(axis=(1, 2)) / np.maximum(weight.sum(axis=(1, 2)), 1))
+        residual, weight = problem.residual(volume, moves, held)
+        return np.sqrt((residual**2).sum(axis=(1, 2)) / np.maximum(weight.sum(axis=(1, 2)), 1))
 
     def typical(each: NDArray[np.float64], part: int) -> float:
         own = each[parts[held] == part]
@@ -199,7 +201,7 @@ def judge(
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Projections in parts; the volume has the position of the longest part."""
+    """Projections in several parts. The volume has the position that the sample has in the longest part."""
 
     projections: F32
     geometry: Geometry
@@ -243,7 +245,7 @@ class _Problem:
         return solve(method, projector, data, weight=weight, go_on=_NO_TRIALS)
 
     def residual(self, volume: Volume, moves: Sequence[Displacement], views: NDArray[np.integer]) -> tuple[F32, F32]:
-        """Measured minus computed projections, without smooth differences, and the weights of the rays."""
+        """Measured minus computed projections, without smooth differences. Also the weights of the rays."""
         data, geometry, weight = self.corrected(moves, views)
         return _without_smooth(data - Projector(geometry, self.grid).forward(volume.data), weight), weight
 
@@ -251,22 +253,22 @@ class _Problem:
         self, volume: Volume, move: Displacement, views: NDArray[np.integer], weight: NDArray[np.float64],
         relaxation: float = 1.0,
     ) -> Displacement:  # fmt: skip
-        """The displacement of these projections after one least-squares step (Gauss-Newton) towards the volume's."""
+        """The displacement of these projections after one least-squares step (Gauss-Newton) towards the volume."""
         geometry = self.geometry.select(views)
         pitch, all_one = geometry.pixel_pitch, np.zeros(views.size, np.int64)
-        half = geometry.detector_shape[1] / 2  # columns
+        half = geometry.detector_shape[1] / 2  # in columns
         trial = TRIAL * np.array([pitch, pitch, pitch, 1 / half, pitch, 1 / half])
         now = np.array([move.x, move.y, move.z, move.turn, move.image, move.magnification])
 
-        def shown(at: NDArray[np.float64]) -> F32:
-            moved = displaced(geometry, all_one, [Displacement(*at.tolist())])
+        def shown(values: NDArray[np.float64]) -> F32:
+            moved = displaced(geometry, all_one, [Displacement(*values.tolist())])
             return Projector(moved, self.grid).forward(volume.data)
 
         data, _, rays = _Problem(self.projections[views], geometry, all_one, self.known).corrected(
             [move], np.arange(views.size)
         )
         image = shown(now)
-        left = _without_smooth(data - image, rays)
+        residual = _without_smooth(data - image, rays)
         change: list[NDArray[np.floating]] = []
         for i in range(5 if self.optics else 4):
             step = np.where(np.arange(now.size) == i, trial, 0)
@@ -275,7 +277,7 @@ class _Problem:
             change.append(_without_smooth(trial[5] * _outwards(image, geometry), rays))
         across = np.stack(change).reshape(len(change), views.size, -1)
         normal = np.einsum("avp,bvp,v->ab", across, across, weight, optimize=True)
-        slope = np.einsum("avp,vp,v->a", across, left.reshape(views.size, -1), weight, optimize=True)
+        slope = np.einsum("avp,vp,v->a", across, residual.reshape(views.size, -1), weight, optimize=True)
         best = np.zeros(now.size)
         best[: len(change)] = np.linalg.lstsq(normal, slope, rcond=1e-6)[0] * relaxation
         longest = float(np.abs(best).max()) * TRIAL

@@ -47,8 +47,8 @@ def predicted_views(
 ) -> tuple[NDArray[np.intp], F32]:
     """Numbers of the held-out projections, and their images [view, row, col] predicted by a volume from the others.
 
-    They are chosen as by `split_views`, but with a period of 360° for any axis, so that geometries are compared by the
-    same projections.
+    They are chosen as in `split_views`, but with a period of 360° for every geometry, so that geometries are compared
+    with the same projections.
     """
     seen, unseen = split_views(views.geometry, one_in, 2 * np.pi)
     volume = method.run(ReconProblem(views.select(seen), grid), RunControl(decide=decide)).volume

@@ -33,14 +33,14 @@ from recon.voxels.projector import Projector, projection_lines, volume_lines, vo
 from recon.voxels.resolution import smoothed
 from recon.voxels.voxel_problem import Buffers, Units, VoxelProblem, bytes_of, times_power
 
-UNITS = "units"  # name of the decision on the units
+UNITS = "units"  # name of the decision about the units
 TV_WEIGHT_CHOSEN = "tv_weight_chosen"
 """Name of the weight of total variation that a method chose, as a value of its setting `tv_weight`."""
 _SHARE = 2**16  # fewest voxels per thread in a single slice; with fewer, threads mostly wait for each other
 
 
 class Iterating(Protocol):
-    """What `solve` runs: a `VoxelMethod` or a part of it."""
+    """Something that `solve` can run: a `VoxelMethod` or a part of one."""
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
@@ -49,7 +49,8 @@ class Iterating(Protocol):
 def watched(
     control: RunControl, n_views: int, usual_trials: int = 0, report: Callable[[int, float], object] = lambda *_: None
 ) -> GoesOn:
-    """Whether iterations, and those of test reconstructions, go on by this control; `report` is told of the former.
+    """Decides, from this control, whether iterations and test reconstructions continue. `report` gets the progress of
+    the iterations.
 
     Args:
         usual_trials: usual number of iterations of all test reconstructions, for the progress.
@@ -119,8 +120,8 @@ def solve_views(
     """`solve` for projections in the projector's geometry, with their weights and the reach of the sample."""
     problem, lines = scaled_problem(projector, views, start, nonnegative, go_on or GoesOn(), decide or Decisions())
     with threads_for(projector.grid):
-        found = method.iterate(problem, lines)
-    return Volume(volume_slices(times_power(found, problem.units.density)), projector.grid)
+        solution = method.iterate(problem, lines)
+    return Volume(volume_slices(times_power(solution, problem.units.density)), projector.grid)
 
 
 @contextmanager
@@ -187,11 +188,13 @@ class VoxelMethod(Iterative):
         return self.iterations
 
     def further_sweeps(self, geometry: Geometry, grid: Grid) -> int:
-        """Usual time after `iterations`, in iterations; 0 unless further ones use smaller voxels."""
+        """Usual time after `iterations`, as a number of iterations; 0 unless further iterations use smaller voxels."""
         return 0
 
     def refit(self, share: float) -> VoxelMethod:
-        """The method with this share of its iterations, for error bars, which continue from a finished volume."""
+        """The method of the refits for error bars: it continues from a finished volume and makes this share of the
+        iterations.
+        """
         return replace(self, iterations=max(1, round(share * self.iterations)))
 
     def toy(self) -> Self:
@@ -223,7 +226,7 @@ class VoxelMethod(Iterative):
 
 
 def _checked(projector: Projector, projections: F32, weight: F32 | None) -> tuple[F32, F32 | None]:
-    """Data and weights as lines; values with weight 0 become 0."""
+    """Data and weights in the order [view, col, row]. Values with weight 0 become 0."""
     require_views(projector.geometry, projections)
     finite = np.isfinite(projections)
     if weight is not None:

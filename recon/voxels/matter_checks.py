@@ -1,4 +1,6 @@
-"""Checks of a volume: mass where projections show no material, structure in the residual, lost weak material."""
+"""Checks of a volume: material in places that the projections show to be empty, structure in the residual, and lost
+weak material.
+"""
 
 from __future__ import annotations
 
@@ -19,22 +21,25 @@ from recon.base.view_data import Views
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import fbp, fbp_memory, is_gridded
-from recon.voxels.projector import Projector, seen_rays
-from recon.voxels.resolution import at_voxel_resolution
+from recon.voxels.one_projection import AskedRays, RayCheck, in_bands
+from recon.voxels.projector import Projector, projection_images, seen_rays
+from recon.voxels.resolution import ViewResolution, at_voxel_resolution
 from recon.voxels.view_weights import seen_by
 
 STRAY_LIMIT = 0.05
 """Share of the mass above which there is a warning, see docs/published.md."""
 
-_VIEWS, _AGREE = 24, 2  # projections examined; number of them that must show a voxel as empty
-# blur in pixels; limit in standard deviations of the blurred noise; and as a share of the 99th percentile
+_VIEWS, _AGREE = 24, 2  # number of examined projections; number of projections that must show a voxel as empty
+# blur in pixels; limit in standard deviations of the blurred noise; limit as a share of the 99th percentile
 _BLUR, _SIGMAS, _LEAST = 1.0, 4.0, 0.005
-_WHOLE = 0.999  # share of the rays of a voxel that pass through air only
-# most voxels examined (at least one slice); most voxels of a volume whose rows do not show slices
+_WHOLE = 0.999  # share of the rays of a voxel that must pass through air only
+# largest number of examined voxels (at least one slice is examined); the same for a volume whose rows do not show
+# slices
 _MOST, _MOST_WHOLE = 2**18, 2**21
 _WORK = 40  # bytes per examined voxel
-_LEAST_AIR = 100  # least number of voxels, or blocks, from which an air level is taken
-_MATTER, _FAINT = 99.5, 0.05  # percentile that is the density unit; share of it above which a density counts
+_LEAST_AIR = 100  # fewest voxels, or blocks, from which an air level is computed
+# percentile that is the density unit; share of the density unit above which a density counts
+_MATTER, _FAINT = 99.5, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +51,8 @@ class StrayMass:
             unit.
         map: float32 [y, x], the highest density along z in these voxels.
         first: number of the first examined slice.
-        air: bool [slice, y, x], those of these voxels that all examined projections see; outside, FBP is meaningless.
+        air: bool [slice, y, x], the empty voxels that all examined projections see. In other empty voxels FBP has no
+            meaning.
     """
 
     share: float
@@ -63,7 +69,8 @@ class StrayMass:
 
 
 def stray_mass(volume: Volume, views: Views) -> StrayMass | None:
-    """Density in voxels that the projections show to be empty; in a large volume, only in slices around its middle.
+    """The mass in voxels that the projections show to be empty. In a large volume, only slices around the middle are
+    examined.
 
     Returns:
         None if no voxel is shown to be empty, the volume contains no material, or it is large and rows do not show
@@ -109,10 +116,11 @@ def _looked_at(geometry: Geometry, grid: Grid) -> int:
 
 
 def seen_empty(views: Views, grid: Grid) -> tuple[Mask, Mask]:
-    """Voxels [z, y, x] that at least two of up to 24 projections show as empty, and voxels that all of these see.
+    """The voxels [z, y, x] that at least two of up to 24 projections show as empty, and the voxels that all these
+    projections see.
 
     A ray crosses no material if its line integral, blurred by a pixel, is within four standard deviations of the noise,
-    or within 0.5 % of the line integrals of the thick parts. So much thinner material counts as air.
+    or within 0.5 % of the line integrals of the thick parts. Thinner material counts as air.
     """
     part = views.select(spread(np.arange(views.geometry.n_views), _VIEWS)).masked()
     data, known = part.data, part.weights
@@ -139,12 +147,13 @@ UNEXPLAINED_LIMIT = 0.007
 round off edges, up to 0.004 in sixteen fits with voxel refinement, and up to 0.005 in true volumes.
 """
 
-_SIGNIFICANT = 4.0  # standard deviations of the noise; above it, the share of noise is below 1e-3
+_SIGNIFICANT = 4.0  # standard deviations of the noise; above it, the share of voxels with noise only is below 1e-3
 _FLIPS = 6
-_SMOOTH, _AROUND = 1.0, 4.0  # pixels: smoothing of the detail, and of the map of the noise
-_ROWS, _COLS = 8, 256  # rows used for this number of columns; fewer for wider detectors
+_SMOOTH, _AROUND = 1.0, 4.0  # pixels: smoothing of the detail, and smoothing of the map of the noise
+_ROWS, _COLS = 8, 256  # number of rows that are used for this number of columns; fewer rows for wider detectors
 _LEAST_VIEWS = 16
-# share of the 99th percentile that is material; voxels of closing, so that cracks belong to the material
+# share of the 99th percentile above which a voxel is material; radius of the closing in voxels, so that cracks belong
+# to the material
 _DENSE, _CLOSED = 0.2, 2
 
 
@@ -164,54 +173,68 @@ class Unexplained:
     significance: F32
 
 
-def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> Unexplained | None:
+def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> RayCheck[Unexplained | None]:
     """Filtered back-projection of the residual p - A x, divided by its noise (measured with random signs).
 
-    With random signs of the projections, structure cancels, because all projections share it, and noise remains [our
-    own; after the odd-even differences of half-sets]. Pixels that make rings are removed first. Up to eight rows around
-    the middle of the material are used, or one row if the detector has 700 columns or more. If the projections move
-    along the axis, the rows that see most of the material are used.
+    If projections get random signs, structure cancels because all projections share it, and noise remains (our own
+    method, after the odd-even differences of half-sets). Pixels that make rings are removed first. Up to eight rows
+    around the middle of the material are used, or one row if the detector has 700 columns or more. If the projections
+    move along the axis, the rows that see most of the material are used.
 
     Args:
         volume: the volume on the slices of the detector rows, 1/mm.
         seen: the projections.
 
     Returns:
-        None for a cone, rolled or tilted projections, fewer than 16 projections, other slices, or a volume without
-        material.
+        The check. Its result is None for a cone, rolled or tilted projections, fewer than 16 projections, other slices,
+        or a volume without material.
     """
+    nothing: RayCheck[Unexplained | None] = RayCheck((), lambda: None)
     geometry, slices = seen.geometry, volume.grid.shape[0]
     rows_differ = geometry.is_cone or not geometry.is_straight or volume.grid != Grid.matching(geometry)
     if rows_differ or geometry.n_views < _LEAST_VIEWS:
-        return None
+        return nothing
     n = min(_rows_looked_at(geometry), slices)
     mass = np.array([np.maximum(image, 0).sum(dtype=np.float64) for image in volume.data])
     middle = round(float(mass @ np.arange(slices) / mass.sum())) if mass.any() else 0
     first = min(max(middle - n // 2, 0), slices - n)
-    if geometry.climbs:  # few projections see the slices in between
+    if geometry.climbs:  # few projections see the slices between the ends
         at = volume.grid.coordinates()[0] / geometry.pixel_pitch + geometry.axis_row
         first = int(np.convolve(mass * seen_by(geometry, at).sum(axis=0), np.ones(n), "valid").argmax())
-    rows, views, box = part_of(geometry, volume.grid, slice(first, first + n))
+    rows, _, box = part_of(geometry, volume.grid, slice(first, first + n))
     part = Volume(np.ascontiguousarray(volume.data[first : first + n]), box)
     level = _DENSE * float(np.percentile(part.data, 99))
     matter = np.stack([ndimage.binary_closing(image > level, iterations=_CLOSED) for image in part.data])
     if level <= 0 or not matter.any():
-        return None
-    measured, projector = seen.data[:, rows], Projector(views, part.grid)
-    unseen = np.broadcast_to(~seen_rays(views, part.grid), measured.shape)
-    if seen.weights is not None:
-        unseen = unseen | (seen.weights[:, rows] == 0)
-    lines = np.where(unseen, np.float32(0), measured).swapaxes(1, 2)  # at the resolution of voxels, like the model
-    left = at_voxel_resolution(lines, projector.resolution, ~unseen.swapaxes(1, 2)).swapaxes(1, 2)
-    left = left - projector.forward(part.data)
+        return nothing
+    shown, model = seen.rows(rows), list[F32]()
+    parts = [AskedRays(np.arange(geometry.n_views), rows, lambda lines: model.append(projection_images(lines)))]
+    if not in_bands(geometry, volume.grid):  # the rows also show other slices, so these slices are projected alone
+        parts, model = [], [Projector(shown.geometry, box).forward(part.data)]
+    return RayCheck(parts, lambda: _structure(shown, model[0], part, first, matter, rng))
+
+
+def _structure(
+    shown: Views, model: F32, part: Volume, first: int, matter: Mask, rng: np.random.Generator
+) -> Unexplained:
+    """Compute the result of `unexplained` for the slices from `first` on, whose projection is `model` [view, row,
+    col].
+    """
+    geometry, box = shown.geometry, part.grid
+    unseen = np.broadcast_to(~seen_rays(geometry, box), model.shape)
+    if shown.weights is not None:
+        unseen = unseen | (shown.weights == 0)
+    lines = np.where(unseen, np.float32(0), shown.data).swapaxes(1, 2)  # at the resolution of voxels, like the model
+    left = at_voxel_resolution(lines, ViewResolution.of(geometry, box), ~unseen.swapaxes(1, 2)).swapaxes(1, 2)
+    left = left - model
     left[unseen] = 0
-    left -= ring_offsets(left, views)
+    left -= ring_offsets(left, geometry)
     left[unseen] = 0
 
     signs = np.where(np.arange(len(left)) % 2, np.float32(1), np.float32(-1))
     kinds = np.stack([np.ones_like(signs), *(rng.permutation(signs) for _ in range(_FLIPS))])
-    first_kind, *flipped = _fbp_of_each(left, kinds, views, box)
-    found, variance = _smoothed(first_kind), np.zeros(part.grid.shape, np.float32)
+    first_kind, *flipped = _fbp_of_each(left, kinds, geometry, box)
+    found, variance = _smoothed(first_kind), np.zeros(box.shape, np.float32)
     for images in flipped:
         variance += _smoothed(images) ** 2 / _FLIPS
     noise = np.sqrt(gaussian_filter(variance, (0, _AROUND, _AROUND)))
@@ -239,7 +262,7 @@ def _smoothed(images: F32) -> F32:
 def _fbp_of_each(residual: F32, signs: F32, views: Geometry, box: Grid) -> list[F32]:
     """FBP of the slices of the box, from the residual times each row of signs [kind, view].
 
-    If projections do not move along the axis, all results are slices of one volume, which takes less time.
+    If projections do not move along the axis, all results are computed as slices of one volume, which takes less time.
     """
     rows, cols = views.detector_shape
     kinds = len(signs)
@@ -253,13 +276,13 @@ def _fbp_of_each(residual: F32, signs: F32, views: Geometry, box: Grid) -> list[
     return list(images.reshape(kinds, rows, *images.shape[1:]))
 
 
-_BLOCKS = 96  # most blocks along the longest side of a volume
-_SMOOTHED_BLOCKS, _ABOVE_AIR = 1.5, 5.0  # smoothing in blocks; least density of material, in standard deviations of air
-_MARGIN, _RIM = 4, 0.92  # blocks around matter; share of the radius that all views see
-_LEFT = 0.5  # share of the density in FBP; a block with less has lost its material
-# blocks along z, y and x of the boxes of which a region consists; fewest blocks of a region
+_BLOCKS = 96  # largest number of blocks along the longest side of a volume
+_SMOOTHED_BLOCKS, _ABOVE_AIR = 1.5, 5.0  # smoothing in blocks; least density of material in standard deviations of air
+_MARGIN, _RIM = 4, 0.92  # blocks around material; share of the radius that all projections see
+_LEFT = 0.5  # a block has lost its material if its density is below this share of the density in FBP
+# size along z, y and x, in blocks, of the boxes of which a region consists; fewest blocks of a region
 _CORE, _LEAST_REGION = (3, 5, 5), 64
-_BESIDE = 2  # blocks next to slices without beam, which smoothing mixes with these slices
+_BESIDE = 2  # blocks next to slices without beam; smoothing mixes them with these slices
 
 
 @dataclass(frozen=True)
@@ -268,7 +291,7 @@ class LostMatter:
 
     Attributes:
         region: (z, y, x), each the first voxel and the one after the last.
-        kept: mass in this region divided by the mass in FBP, each relative to its own air level.
+        kept: mass in this region divided by the mass in FBP. Both masses are relative to the air level of their volume.
     """
 
     region: tuple[tuple[int, int], ...]

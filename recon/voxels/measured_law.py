@@ -8,7 +8,7 @@ Tibshirani 1993, ch. 6.5). The copy shows the share of noise in the error. Then 
 of the projections are judged by the held-out eighth, in the scan and in the copy. The measure is the power of their
 residual, filtered by the root of the ramp, minus that of the noise of the open beam. (By the theorems of Parseval and
 of the central slice, this power is the square error of the volume.) If the error falls less in the scan than in the
-copy, it has parts that more projections do not reduce.
+copy, a part of the error is not reduced by more projections.
 """
 
 from __future__ import annotations
@@ -41,13 +41,15 @@ from recon.voxels.standstill import MOST_SWEEPS
 from recon.voxels.voxel_problem import VoxelProblem
 
 LEAST_VIEWS = 40
-# measured on ten scans: 0.5 to 0.7 and 0.1 to 0.4 (tests/bench/next_pass.py)
+# exponents measured on ten scans: 0.5 to 0.7 and 0.1 to 0.4 (tests/bench/next_pass.py)
 _NOISE_EXPONENT, _OTHER_EXPONENT = 0.6, 0.3
-# noise share x ratio of falls: below the first value other errors dominate, above the second noise does
+# limits of noise share x ratio of falls: below the first value other errors dominate, above the second value noise
+# dominates
 _NOISE_PRODUCT = 0.08, 0.16
-_EXPONENT_ERROR = 0.25  # relative; a convention: the range of a gain is then from half to one and a half times the gain
-_GAPS_ERROR = 0.46  # the same if gaps between projections dominate; ten scans had exponents from 0.41 to 1.15
-# share of the error that falls with more light at the same angles, over the exponent; median of 14 pairs
+# relative uncertainty of a gain, a convention: the range is from half to one and a half times the gain
+_EXPONENT_ERROR = 0.25
+_GAPS_ERROR = 0.46  # the same if gaps between projections dominate; on ten scans the exponents were 0.41 to 1.15
+# how the error falls with more light at the same angles, as a share of the exponent; median of 14 pairs of scans
 _SAME_ANGLES = 0.8
 # factor on the measured fall, because projections also show errors between voxels, which do not fall
 _VOLUME_OVER_VIEWS = 2.1
@@ -117,7 +119,8 @@ def measured_law(
 
 
 def _fall_ratio(scan: Sequence[float], copy: Sequence[float]) -> float | None:
-    """The fall of the error from the first volume to the second in the scan, divided by that in its copy, 0 to 1.
+    """The fall of the error from the first volume to the second volume in the scan, divided by the fall in the copy; 0
+    to 1.
 
     Args:
         scan, copy: `_Slab.unseen_power` of the two volumes.
@@ -133,9 +136,10 @@ def _fall_ratio(scan: Sequence[float], copy: Sequence[float]) -> float | None:
 
 @dataclass(frozen=True)
 class _TotalVariation:
-    """FISTA-TV with a weight that is stated for one projection.
+    """FISTA-TV whose weight is given for one projection.
 
-    For n projections the weight is √n times as large, like the noise in the gradient of the sum over them.
+    For n projections the weight is √n times as large, like the noise of the gradient, which is a sum over the
+    projections.
     """
 
     weight: float
@@ -149,7 +153,7 @@ class _TotalVariation:
 
 @dataclass(frozen=True)
 class _WeightByNoise:
-    """Decides the weight of total variation from the noise of the projections, and makes no volume."""
+    """Chooses the weight of total variation from the noise of the projections, without making a volume."""
 
     iterations: int = MOST_SWEEPS
 
@@ -241,7 +245,7 @@ class _Slab:
 
 
 def _ramp_power(lines: F32) -> float:
-    """Mean power of lines [view, col, row] after the root of the ramp along columns."""
+    """Mean power of lines [view, col, row] after filtering with the root of the ramp along columns."""
     n = 2 * lines.shape[1]
     spectrum = np.fft.rfft(lines, n, axis=1)
     return float(np.mean(np.fft.rfftfreq(n)[None, :, None] * np.abs(spectrum) ** 2))

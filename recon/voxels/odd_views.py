@@ -1,37 +1,40 @@
-"""odd_views: finds projections that differ in a part from the volume made from them, more than their neighbours do."""
+"""odd_views: finds projections in which a part differs from the volume more than in the neighbouring projections."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, label, uniform_filter
 
-from recon.base.arrays import F32, bin_views
+from recon.base.arrays import F32, I64, bin_views
 from recon.base.geometry import Geometry
 from recon.base.noise import deviation_between_neighbours
-from recon.base.slabs import part_of
 from recon.base.view_data import Views
-from recon.base.volume import Grid, Volume
-from recon.voxels.projector import Projector, project, projection_images, volume_lines
+from recon.base.volume import Grid
+from recon.voxels.one_projection import AskedRays, RayCheck, in_bands
+from recon.voxels.projector import projection_images
 
 LIMIT = 12.0
 """Limit of the score, in standard deviations of the usual differences. Clean real scans stay below 9.4."""
 
-_CELLS = 128  # least number of columns of cells, if the detector has that many pixels
-_BLUR = 4  # pixels; reach of a blur by one pixel
-_BAND, _TOGETHER = 16, 32  # rows that are projected together; projections that are compared together
-_AT_A_TIME = 8  # projections of a cone that are computed together
-_BROAD = 3  # side, in cells, of the area over which a difference is averaged
-# projections on either side that define the usual difference; number of nearest ones that are left out
+_CELLS = 128  # fewest columns of cells, if the detector has that many pixels
+_BLUR = 4  # pixels; range of a blur by one pixel
+# number of rows of cells that are compared together; number of projections that are compared together
+_BAND, _TOGETHER = 16, 32
+_AT_A_TIME = 8  # number of projections of a cone beam that are computed together
+_BROAD = 3  # side of the area, in cells, over which a difference is averaged
+# number of projections on either side that define the usual difference; number of nearest projections that are left out
 _AROUND, _BESIDE = 12, 3
-# least noise of a pixel, as a share of the largest line integral; frames and residuals of fits have no less
+# least noise of a pixel as a share of the largest line integral; frames, and residuals of fits, have at least this
+# noise
 _LEAST_NOISE = 2e-3
-_OUTLIER = 3.0  # largest contribution of one projection, in medians of all
-_SHARP = 0.1  # a volume may miss an edge by this share of what a blur of one pixel changes
-_EXTENT = 0.5  # share of the limit above which a cell belongs to the region
+_OUTLIER = 3.0  # largest contribution of one projection, in units of the median over all projections
+_SHARP = 0.1  # a volume may miss an edge by this share of the change that a blur of one pixel causes
+_EXTENT = 0.5  # a cell belongs to the region if its score exceeds this share of the limit
 _LEAST_VIEWS = 2 * _AROUND + 1
 
 
@@ -51,31 +54,40 @@ class OddView:
     cols: tuple[int, int]
 
 
-def odd_views(
-    volume: Volume, views: Views, progress: Callable[[int, int], None] = lambda done, of: None
-) -> tuple[OddView, ...]:
+def odd_views(grid: Grid, views: Views) -> RayCheck[tuple[OddView, ...]]:
     """Projections in which something crossed the beam or the sample was displaced, found in the differences p - A x.
 
     The check takes the difference of each projection from that of the volume, minus the common change of its pixels
     (light). It averages the difference over 3 x 3 cells, in standard deviations of the projection's noise and finest
     detail. No volume fits its projections perfectly at edges that it blurs, at rings, or outside the field of view. So
     a difference is compared with the same place in the 18 projections at the nearest angles. It is also compared with
-    the edges of the volume in the projection itself, because a face or a crack parallel to the rays is sharp only in a
-    few projections [our own].
-
-    Args:
-        progress: function called with the number of projections compared so far, and their total number. In bands of
-            rows, each band counts with its share.
+    the edges of the volume in the projection itself, because a face or a crack that is parallel to the rays is sharp
+    only in a few projections (our own method).
 
     Returns:
-        The parts in the order of the projections; empty for fewer than 25 projections.
+        The check. Its result is the parts in the order of the projections; empty for fewer than 25 projections.
     """
-    n, side = views.geometry.n_views, _side(views.geometry)
-    if n < _LEAST_VIEWS:
-        return ()
-    order = np.argsort(views.geometry.angles, kind="stable")
-    differences, edges = (each[order] for each in _differences(volume, views, side, progress))
-    found = []
+    geometry, side = views.geometry, _side(views.geometry)
+    every, rows = np.arange(geometry.n_views), geometry.detector_shape[0]
+    if every.size < _LEAST_VIEWS:
+        return RayCheck((), lambda: ())
+    cells = _Cells(*(np.zeros((every.size, rows // side, geometry.detector_shape[1] // side), np.float32)
+                     for _ in range(6)))  # fmt: skip
+    if in_bands(geometry, grid):
+        band, end = _band(geometry), rows - rows % side  # rows at the end that do not fill a cell do not count
+        own = [slice(first, min(first + band, end)) for first in range(0, end, band)]
+        asked = [(every, part, slice(max(part.start - _BLUR, 0), min(part.stop + _BLUR, rows))) for part in own]
+    else:
+        groups = (every[first : first + _AT_A_TIME] for first in range(0, every.size, _AT_A_TIME))
+        asked = [(some, slice(0, rows), slice(0, rows)) for some in groups]
+    parts = [AskedRays(some, around, partial(_fill, cells, views, some, own, around)) for some, own, around in asked]
+    return RayCheck(parts, lambda: _odd(*_differences(cells, side), geometry, side))
+
+
+def _odd(differences: F32, edges: F32, geometry: Geometry, side: int) -> tuple[OddView, ...]:
+    """The odd projections, found in the `_differences` of all projections."""
+    n, order, found = geometry.n_views, np.argsort(geometry.angles, kind="stable"), []
+    differences, edges = differences[order], edges[order]
     for place in range(n):
         first = min(max(place - _AROUND, 0), n - _LEAST_VIEWS)
         neighbours = [k for k in range(first, first + _LEAST_VIEWS) if abs(k - place) > _BESIDE]
@@ -96,7 +108,8 @@ def odd_views_memory(geometry: Geometry) -> int:
     """Approximate memory of `odd_views` in bytes, without projections and volume."""
     views, (rows, cols) = geometry.n_views, geometry.detector_shape
     side, height = _side(geometry), min(_band(geometry), rows)
-    band = (height + 2 * _BLUR) * cols * (cols + 2 * views + 8 * _TOGETHER)
+    # while two bands wait for rows, the rows that both need are computed and copied
+    band = (height + 2 * _BLUR) * cols * (cols + 4 * views + 8 * _TOGETHER)
     return 4 * (band + 7 * views * (rows // side) * (cols // side))
 
 
@@ -110,74 +123,65 @@ def _band(geometry: Geometry) -> int:
     return _side(geometry) * max(1, _BAND // _side(geometry))
 
 
-def _projected(volume: Volume, geometry: Geometry) -> Iterator[tuple[slice, slice, F32, F32]]:
-    """Yields projections, rows, the volume's projection [view, row, col] and its sharp part.
-
-    In bands if rows are slices.
-    """
-    rows, band = geometry.detector_shape[0], _band(geometry)
-    if not geometry.rows_show_slices or volume.grid != Grid.matching(geometry):
-        lines = volume_lines(volume.data)  # only once, because for a large volume it takes as long as a projection
-        for view in range(0, geometry.n_views, _AT_A_TIME):
-            some = slice(view, view + _AT_A_TIME)
-            model = projection_images(Projector(geometry.select(some), volume.grid).forward_lines(lines))
-            yield some, slice(0, rows), model, _sharp(model)
-        return
-    whole = rows - rows % _side(geometry)  # rows at the end that do not fill a cell do not count
-    for first in range(0, whole, band):
-        part = slice(first, min(first + band, whole))
-        around = slice(max(first - _BLUR, 0), min(part.stop + _BLUR, rows))
-        _, views, grid = part_of(geometry, volume.grid, around)
-        every = project(Volume(volume.data[around], grid), views)
-        own = slice(first - around.start, part.stop - around.start)
-        for view in range(0, geometry.n_views, _TOGETHER):
-            models = every[view : view + _TOGETHER]
-            yield slice(view, view + _TOGETHER), part, models[:, own], _sharp(models)[:, own]
-
-
 def _sharp(models: F32) -> F32:
     """Projections [view, row, col] minus the same projections blurred by a pixel."""
     return np.abs(models - gaussian_filter(models, (0, 1, 1), truncate=_BLUR))
 
 
-def _differences(volume: Volume, whole: Views, side: int, progress: Callable[[int, int], None]) -> tuple[F32, F32]:
+class _Cells(NamedTuple):
+    """Means over cells [view, cell, cell]. Pixels are weighted with the square root of the intensity; unknown pixels
+    have the weight 0. The means are: the difference of the projections from the volume, the part of the difference that
+    edges explain, the known pixels, the projection, the weight, and the difference without weight.
+    """
+
+    difference: F32
+    edges: F32
+    known: F32
+    projection: F32
+    weight: F32
+    plain_difference: F32
+
+
+def _fill(cells: _Cells, whole: Views, some: I64, own: slice, around: slice, lines: F32) -> None:
+    """Compute the cells of some projections in the rows `own`, from the projection of the volume in these and the
+    neighbouring rows (`around`).
+    """
+    side, rows = _side(whole.geometry), slice(own.start - around.start, own.stop - around.start)
+    for first in range(0, some.size, _TOGETHER):
+        views = slice(int(some[0]) + first, int(some[0]) + min(first + _TOGETHER, some.size))
+        images = projection_images(lines[first : first + _TOGETHER])
+        model, measured = images[:, rows], whole.data[views, own]
+        difference = measured - model
+        known = np.ones_like(model) if whole.weights is None else (whole.weights[views, own] > 0).astype(np.float32)
+        weight = np.sqrt(np.exp(-np.clip(measured, 0, 20))) * known
+        values = (
+            difference * weight,
+            _sharp(images)[:, rows] * weight,
+            known,
+            measured * weight,
+            weight,
+            difference * known,
+        )
+        for cell, value in zip(cells, values, strict=True):
+            cell[views, own.start // side : own.stop // side] = bin_views(value, side)
+
+
+def _differences(cells: _Cells, side: int) -> tuple[F32, F32]:
     """The difference of the projections from the volume, and the part of it that edges explain.
 
     Both are [view, cell, cell], averaged over cells, in standard deviations of the noise.
     """
-    geometry, weights = whole.geometry, whole.weights
-    rows, cols = (n // side for n in geometry.detector_shape)
-    # `weight` is the square root of the intensity, 0 in unknown pixels. Means over cells are computed of the weighted
-    # difference, its part that edges explain, the known pixels, the weighted projection, the weight, and the difference
-    # without weight.
-    cells, edges, known_cells, weighted_cells, weight_cells, mean_difference = (
-        np.zeros((geometry.n_views, rows, cols), np.float32) for _ in range(6)
-    )
-    compared = 0
-    for views, part, model, sharp in _projected(volume, geometry):
-        measured = whole.data[views, part]
-        difference = measured - model
-        known = np.ones_like(model) if weights is None else (weights[views, part] > 0).astype(np.float32)
-        weight = np.sqrt(np.exp(-np.clip(measured, 0, 20))) * known
-        block = views, slice(part.start // side, part.stop // side)
-        cells[block], known_cells[block] = bin_views(difference * weight, side), bin_views(known, side)
-        weighted_cells[block], weight_cells[block] = bin_views(measured * weight, side), bin_views(weight, side)
-        mean_difference[block] = bin_views(difference * known, side)
-        edges[block] = bin_views(sharp * weight, side)
-        compared += len(model) * model.shape[1]
-        progress(min(compared // (rows * side), geometry.n_views), geometry.n_views)
-    for view, (cell, edge) in enumerate(zip(cells, edges, strict=True)):
+    for cell, edge, known, projection, weight, plain in zip(*cells, strict=True):
         # the finest detail of the sample counts as noise
-        detail = deviation_between_neighbours(weighted_cells[view], 3)
-        noise = max(detail, _LEAST_NOISE / side * float(np.abs(weighted_cells[view]).max()))
-        if not known_cells[view].any() or not noise > 0:
+        noise = max(deviation_between_neighbours(projection, 3), _LEAST_NOISE / side * float(np.abs(projection).max()))
+        if not known.any() or not noise > 0:
             cell[...], edge[...] = 0, 0
             continue
-        cell -= np.float32(np.median(mean_difference[view][known_cells[view] > 0])) * weight_cells[view]
+        cell -= np.float32(np.median(plain[known > 0])) * weight
         # Sums over cells with known pixels, divided by their noise. There are fewer cells at an edge, and with a single
         # row.
-        known_share = uniform_filter(known_cells[view], _BROAD, mode="constant")
+        known_share = uniform_filter(known, _BROAD, mode="constant")
         scale = np.divide(_BROAD / noise, np.sqrt(known_share), out=np.zeros_like(known_share), where=known_share > 0)
         cell[...] = uniform_filter(cell, _BROAD, mode="constant") * scale
         edge[...] = uniform_filter(_SHARP * edge, _BROAD, mode="constant") * scale
-    return cells, edges
+    return cells.difference, cells.edges

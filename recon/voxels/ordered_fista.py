@@ -40,11 +40,12 @@ from recon.voxels.voxel_problem import (
 
 SUBSETS, MANY_SUBSETS = 3, 9
 """Largest number of subsets: for sweeps until the volume has converged, and for a fixed number of sweeps."""
-_LEAST_OF_SUBSET, _LEAST_OF_MANY = 15, 12  # smallest number of projections in a subset: see `SUBSETS`
+_LEAST_OF_SUBSET, _LEAST_OF_MANY = 15, 12  # smallest number of projections in a subset, see `SUBSETS`
 # Subsets save time and do not change the volume at which the damped steps end. With one subset, 30 projections need 45
 # sweeps instead of 31, and 180 projections 29 instead of 23, with 0 to 15 % more CPU time. With subsets up to the end:
 # -0.1 to -1.0 dB.
-_LEAST_ON_SUBSETS, _VIEWS_ON_SUBSETS = 6, 540  # sweeps, and projections in sweeps, on subsets: the larger of the two
+# number of sweeps, and number of projections in sweeps, that use subsets: the larger of the two counts
+_LEAST_ON_SUBSETS, _VIEWS_ON_SUBSETS = 6, 540
 _MOST_MOMENTUM = 0.9
 """Largest momentum of damped steps.
 
@@ -58,20 +59,20 @@ The share is small if single rays weigh much more than others. Then 60 damped sw
 20 sweeps without damping. (It is 0.9 without weights, and 0.6 if the sample is three times as wide as the field of
 view.)
 """
-# least covered share of 180° for damped steps, because coarse shapes of a missing wedge converge last
+# smallest covered share of 180° with which steps are damped, because the coarse shapes of a missing wedge converge last
 _LEAST_COVERED = 0.9
-_LOOKED_AT = 9  # number of projections of a sweep whose residual is kept
+_LOOKED_AT = 9  # number of projections of a sweep whose residual is stored
 
 
 @dataclass(frozen=True, eq=False)
 class Subsets:
-    """Subsets of the projections of a problem. All runs with these projections and weights can share them.
+    """Subsets of the projections of a problem. All runs with the same projections and weights can share them.
 
     Attributes:
-        views: indices, for each subset.
-        projectors: for each subset.
-        step: 1 / L, with L the largest eigenvalue of AᵀWA of the subset that weighs most, with all columns.
-        plain_norm: the same eigenvalue, for the projector that is not sharpened.
+        views: indices of the projections, for each subset.
+        projectors: projector of each subset.
+        step: 1 / L, where L is the largest eigenvalue of AᵀWA of the subset with the largest weight, with all columns.
+        plain_norm: the same eigenvalue for the projector without sharpening.
         to_the_end: True: the sweeps end when the volume has converged; False: after a fixed number.
         damping: damping of the steps from a subset; its gain is 1 if steps are not damped.
         damped_step: like `step`, for damped steps and the columns of the problem.
@@ -105,15 +106,15 @@ class Subsets:
             step = cls.of(problem.with_all_columns(), count, to_the_end=False).step
         nz, ny, nx = projector.grid.shape
         undamped = Damping((ny, nx, nz), 1.0)
-        made = cls(views, projectors, step, norm, to_the_end, undamped, step, undamped)
+        subsets = cls(views, projectors, step, norm, to_the_end, undamped, step, undamped)
         of_subset, of_all = (Damping.of(undamped.shape, n) for n in (len(views[heaviest]), projector.geometry.n_views))
         covered = float(angular_weights(projector.geometry.angles).sum()) / math.pi
         if not to_the_end or of_subset.gain == 1 or covered < _LEAST_COVERED:
-            return made
+            return subsets
         longest = 1 / largest_damped(projectors[heaviest], rays[heaviest], of_subset)
         if longest == 0 or longest < _LEAST_PACE * own:  # 0: no ray crosses the box
-            return made
-        return replace(made, damping=of_subset, damped_step=longest, damping_of_all=of_all)
+            return subsets
+        return replace(subsets, damping=of_subset, damped_step=longest, damping_of_all=of_all)
 
     @property
     def is_damped(self) -> bool:
@@ -121,10 +122,10 @@ class Subsets:
 
 
 def subsets_of(geometry: Geometry, most: int = SUBSETS, to_the_end: bool = True) -> int:
-    """Number of subsets, at most `most`; each has `_LEAST_OF_SUBSET` projections or more.
+    """Number of subsets, at most `most`. Each subset has at least `_LEAST_OF_SUBSET` projections.
 
-    With a fixed number of sweeps, each subset has twelve or more. From twelve projections on there are at least two
-    subsets, because with one subset these sweeps stop far from the minimum.
+    With a fixed number of sweeps, each subset has at least twelve projections. From twelve projections on there are at
+    least two subsets, because with one subset these sweeps stop far from the minimum.
     """
     if to_the_end:
         return max(1, min(most, geometry.n_views // _LEAST_OF_SUBSET))
@@ -133,10 +134,10 @@ def subsets_of(geometry: Geometry, most: int = SUBSETS, to_the_end: bool = True)
 
 
 RENEWED = 2
-"""Number of sweeps after which the volume is recomputed towards which steps are pulled."""
+"""The volume towards which steps are pulled is recomputed after this number of sweeps."""
 
 
-# methods with a pull that held-out projections may prefer, also in the voxel refinement of a fit; see `Discrete`
+# methods with a pull that held-out projections may prefer, also for the voxel refinement of a fit; see `Discrete`
 PULLS: dict[str, MethodEntry] = in_folders("recon.features", "PULLS")
 
 
@@ -146,7 +147,7 @@ def pull_methods(**settings: Any) -> list[Any]:
 
 
 class Pull(Protocol):
-    """A volume z that is computed from x, and towards which each step of `ordered_fista` moves x a share of the way.
+    """Computes a volume z from x. Each step of `ordered_fista` moves x towards z by a share of the distance.
 
     Attributes:
         share: the factor c in c (z - x), for a step without damping.
@@ -201,12 +202,12 @@ class _Descent:
         self.x = device.array(x)
         most = _MOST_MOMENTUM if subsets.is_damped else 1.0
         self._gradient, self._ahead = device.copy(self.x), Momentum(self.x, problem.decide, device, most)
-        self._slope: Any = None  # cells of the force of the prior (total variation and x >= 0) at the last point
+        self._slope: Any = None  # cells of the gradient of the prior (total variation and x >= 0) at the last point
         self._target: Any = None
         self.error, self.seen = 0.0, list[F32]()
 
     def renew_target(self) -> None:
-        """Compute the volume again towards which steps are pulled."""
+        """Recompute the volume towards which steps are pulled."""
         if self._pull is not None:
             self._target = self._device.array(self._pull.target(self._device.numpy(self.x)))
 
@@ -214,13 +215,13 @@ class _Descent:
         """One pass over all projections. `go_ahead` adds the momentum after its last step."""
         self.error, self.seen = 0.0, []
         parts = self._parts if on_subsets else [self._all]
-        count, made = len(parts), self._subsets
-        damping, share = (made.damping, 1.0) if on_subsets else (made.damping_of_all, 1 / len(self._parts))
+        count, subsets = len(parts), self._subsets
+        damping, share = (subsets.damping, 1.0) if on_subsets else (subsets.damping_of_all, 1 / len(self._parts))
         mu = weight.value / count
-        for at, s in enumerate(self._problem.rng.permutation(count)):
+        for step, s in enumerate(self._problem.rng.permutation(count)):
             self._residual(parts[s], count, looked_at)
-            self._step(mu, count, damping, made.step * share, made.damped_step * share)
-            if at + 1 < count:
+            self._step(mu, count, damping, subsets.step * share, subsets.damped_step * share)
+            if step + 1 < count:
                 self._ahead(self.x)
 
     def go_ahead(self) -> None:

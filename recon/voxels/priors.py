@@ -93,8 +93,8 @@ class TvWeight:
             variation = total_variation(volume, difference_weights(problem.projector.grid))
             matter = int(np.count_nonzero(volume > MATTER * density_unit(volume)))
             share = SHARE_OF_NOISE * noise**2 * matter / variation if variation > 0 else 0.0
-        left = noise if problem.measured is None else noise_of(problem.data)
-        return cls(share, left * _by_views(problem.projector.geometry), sweeps)
+        whitened_noise = noise if problem.measured is None else noise_of(problem.data)
+        return cls(share, whitened_noise * _by_views(problem.projector.geometry), sweeps)
 
     def after_sweep(self, residual: F32) -> float:
         """Adapt the weight to the residual (some whitened projections [view, col, row]), and return the weight."""

@@ -59,13 +59,13 @@ class _Rays(NamedTuple):
 class Projector:
     """Line integrals A through the voxels of `grid` along the rays of `geometry`, and their transpose Aᵀ.
 
-    Joseph's interpolation (P. M. Joseph 1982, IEEE Trans. Med. Imaging 1, 192): a ray is sampled once in each plane
-    of voxels, bilinearly. The volume is 0 outside the box. The result is in mm times the unit of the volume, float32.
+    Joseph's interpolation (P. M. Joseph 1982, IEEE TMI 1, 192): a ray is sampled once in each plane of voxels,
+    bilinearly. The volume is 0 outside the box. The result is in mm times the unit of the volume, float32.
 
     Attributes:
         matched: True if projections are sharpened to the resolution of the measured ones.
-        device: device on which loops with this projector compute, see `recon.voxels.devices`; its own methods use the
-            CPU.
+        device: device on which loops with this projector compute, see `recon.voxels.devices`; the methods of the
+            projector use the CPU.
         sharpened: [view, 2] variance in px² that the sharpening removes along columns and rows; None: no sharpening.
 
     Raises:
@@ -109,16 +109,17 @@ class Projector:
 
     @property
     def plain(self) -> Projector:
-        """The same projector without sharpening. Its matrix has no negative entries."""
+        """The same projector without sharpening, so that the matrix has no negative entries."""
         return replace(self, matched=False) if self.matched else self
 
     def gain(self, weight: F32 | None = None) -> float:
-        """How much sharpening raises the largest eigenvalue of AᵀWA: the ratio with and without sharpening, at most.
-        `weight` is W, the weight of each ray.
+        """An upper limit of the factor by which sharpening raises the largest eigenvalue of AᵀWA. `weight` is W, the
+        weight of each ray.
 
-        Sharpening by s raises the finest detail by the factor 1 + 2 s. Along rows, this concerns all projections. Along
-        columns, it concerns only projections whose columns differ by less than a voxel at the edge of the field of
-        view. All projections contribute to the largest eigenvector, unless a few rays weigh more than the others.
+        Sharpening by s raises the finest detail by the factor 1 + 2 s. Detail along the rotation axis is raised by all
+        projections. Detail across the axis is raised only by projections whose directions nearly agree: they differ by
+        less than a voxel at the edge of the field of view. The limit assumes that all projections contribute to the
+        largest eigenvector, unless a few rays weigh more than the others.
         """
         if self.sharpened is None:
             return 1.0
@@ -147,16 +148,16 @@ class Projector:
         return self.adjoint
 
     def forward(self, volume: F32) -> F32:
-        """A x: volume [z, y, x] to projections [view, row, col]."""
+        """Compute A x: the projections [view, row, col] of a volume x [z, y, x]."""
         return projection_images(self.forward_lines(volume_lines(_fitting(volume, self.grid.shape, "volume"))))
 
     def adjoint(self, projections: F32) -> F32:
-        """Aᵀ p: projections [view, row, col] to a volume [z, y, x]."""
+        """Compute Aᵀ p: the back-projection, a volume [z, y, x], of projections p [view, row, col]."""
         lines = projection_lines(_fitting(projections, self.projection_shape, "projections"))
         return volume_slices(self.adjoint_lines(lines))
 
     def forward_lines(self, volume: F32) -> F32:
-        """A x: volume [y, x, z] to projections [view, col, row]."""
+        """Compute A x: the projections [view, col, row] of a volume x [y, x, z]."""
         views, rows, cols = self.projection_shape
         result = np.empty((views, cols, rows), np.float32)
         if self._to_rows:
@@ -168,7 +169,7 @@ class Projector:
         return self._spread(result)
 
     def adjoint_lines(self, projections: F32, out: F32 | None = None) -> F32:
-        """Aᵀ p: projections [view, col, row] to a volume [y, x, z]."""
+        """Compute Aᵀ p: the back-projection, a volume [y, x, z], of projections p [view, col, row]."""
         nz, ny, nx = self.grid.shape
         result = np.empty((ny, nx, nz), np.float32) if out is None else out
         projections = self._spread(projections)

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from recon.base.arrays import F32, F64, I64, Mask
+from recon.base.geometry import Geometry
 from recon.base.slabs import part_of
 from recon.base.view_data import Views
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume
+from recon.voxels.one_projection import BAND, AskedRays, RayCheck, in_bands
 from recon.voxels.projector import Projector, projection_lines, volume_lines
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution
 from recon.voxels.voxel_problem import whitened
 
-RAYS, _ROWS = 2**17, 16  # most pixels used of a projection; rows of a band. Bands of rows represent a large detector
-_GROUPS = 4  # groups of projections that are computed one after the other, if rows do not show slices
+RAYS = 2**17  # most pixels of a projection that are used. Bands of rows represent a large detector
+_GROUPS = 4  # number of groups of projections that are computed one after the other, if rows do not show slices
 
 
 class SquaresLeft(NamedTuple):
@@ -43,7 +46,7 @@ class SquaresLeft(NamedTuple):
 
 
 def squares_left(model: F32, views: F32, weight: F32 | None, resolution: ViewResolution) -> SquaresLeft:
-    """Squares of the residual of each projection, at the resolution of voxels.
+    """Sums of the squared residual of each projection, at the resolution of the voxels.
 
     At this resolution the residual of the true volume is only the noise. At the resolution of the measured projections,
     the true volume would have a larger residual than a sharper one.
@@ -59,15 +62,15 @@ def squares_left(model: F32, views: F32, weight: F32 | None, resolution: ViewRes
 
 
 def unseen_residuals(model: F32, views: F32, weight: F32 | None, resolution: ViewResolution) -> F64:
-    """Root mean square [view] of the residuals, see `squares_left`, for projections with a measured ray; [inf] if none
-    has.
+    """[view] root mean square of the residuals (see `squares_left`), for projections with a measured ray; [inf] if no
+    projection has one.
     """
     left, _, rays = squares_left(model, views, weight, resolution)
     return np.sqrt(left[rays > 0] / rays[rays > 0]) if rays.any() else np.full(1, np.inf)
 
 
 def residuals_of(volume: Volume, views: Views) -> F64:
-    """`unseen_residuals` of a volume in these projections."""
+    """The `unseen_residuals` of a volume in these projections."""
     projector = Projector(views.geometry, volume.grid)
     weights = None if views.weights is None else projection_lines(views.weights[...])
     model = projector.forward_lines(volume_lines(volume.data))
@@ -80,63 +83,85 @@ def _summed(left: F32, views: F32, counts: Mask) -> SquaresLeft:
     return SquaresLeft(np.array(sums[0]), np.array(sums[1]), counts.sum(axis=(1, 2), dtype=np.float64))
 
 
-def left_by_volume(
-    volume: Volume, views: Views, most: int, progress: Callable[[int, int], None], *, beside_uniform: bool = False
-) -> tuple[SquaresLeft, tuple[float, float] | None]:
-    """The residual of a volume in at most `most` projections, evenly spread.
+class _Compared(NamedTuple):
+    """Rays of some projections that are compared together, and the voxels through which they pass."""
+
+    geometry: Geometry
+    grid: Grid
+    rows: slice
+    views: I64
+    places: I64  # of the views among all compared ones
+
+
+def residual(grid: Grid, views: Views, most: int) -> RayCheck[tuple[SquaresLeft, float]]:
+    """The residual of a volume on this grid in at most `most` projections, evenly spread.
 
     If a detector has more than 2^17 pixels, only bands of rows with about this number of pixels are used.
 
-    Args:
-        progress: function called with the number of projections compared so far, and their total number.
-        beside_uniform: True: also compare the volume with volumes of uniform density.
+    Returns:
+        The check. Its result is the sums of these projections, and the residual of the volume along rows, see
+        `uniform_residual`.
+    """
+    compared = list(_compared(grid, views, most))
+    sums, along = np.zeros((3, 1 + max(int(each.places[-1]) for each in compared))), np.zeros(2)
+
+    def compare(part: _Compared, model: F32) -> None:
+        lines, counts, seen = _measured(views, part)
+        sums[:, part.places] += _summed(model - seen, lines, counts)
+        along[:] += [np.square(_without_means(image, counts)).sum() for image in (model - seen, lines)]
+
+    parts = [AskedRays(each.views, each.rows, partial(compare, each)) for each in compared]
+    return RayCheck(parts, lambda: (SquaresLeft(*sums), math.sqrt(along[0] / along[1]) if along[1] else 0.0))
+
+
+def uniform_residual(grid: Grid, views: Views, most: int) -> tuple[float, int]:
+    """The residual along rows of a volume of uniform density, in the projections that `residual` compares.
+
+    A residual along rows is computed after the mean of each row is subtracted, because the mean also contains material
+    outside the field of view, which a correct volume does not contain. The uniform volume is a box or a cylinder that
+    fills the slices, with the best density; the smaller of the two residuals counts. A volume with a larger residual
+    does not show the sample yet.
 
     Returns:
-        The sums of these projections. With `beside_uniform`, also two residuals of the differences of rays from the
-        mean of their row. The first is that of the volume. The second is that of a uniform box or cylinder that fills
-        the slices, with the best density; the smaller of the two counts. A volume with a larger residual than this
-        shows nothing of the sample yet. The means of rows are left out, because they also contain material outside the
-        field of view, which a correct volume does not contain. Both residuals are 0 if the projections have no such
-        differences.
+        The residual (0 if the rays do not differ from the mean of their row), and the number of projected rays.
     """
-    some, grid = spread(np.arange(views.geometry.n_views), most), volume.grid
     _, y, x = grid.coordinates()
-    inside = np.hypot(y[:, None], x) < grid.spacing[1] * min(grid.shape[1:]) / 2
-    uniform = [Volume(np.broadcast_to(np.float32(at), grid.shape), grid) for at in (inside, True)]
-    volumes = [volume, *uniform] if beside_uniform else [volume]
-    bands = _bands(views, some, grid)
+    inside = (np.hypot(y[:, None], x) < grid.spacing[1] * min(grid.shape[1:]) / 2).astype(np.float32)
+    own, total, products, norms, rays = 0.0, 0.0, np.zeros(2), np.zeros(2), 0
+    for part in _compared(grid, views, most):
+        lines, counts, seen = _measured(views, part)
+        projector, flat = Projector(part.geometry, part.grid), _without_means(seen, counts)
+        own, total = own + float(np.vdot(flat, flat)), total + float(np.square(_without_means(lines, counts)).sum())
+        for n, at in enumerate((inside, np.ones_like(inside))):
+            uniform = np.broadcast_to(at, part.grid.shape)
+            image = _without_means(projector.forward_lines(volume_lines(uniform)), counts)
+            products[n] += np.vdot(flat, image)
+            norms[n] += np.vdot(image, image)
+        rays += 2 * lines.size
+    least = own - np.divide(products**2, norms, out=np.zeros(2), where=norms > 0).max()
+    return math.sqrt(max(least, 0.0) / total) if total else 0.0, rays
+
+
+def _compared(grid: Grid, views: Views, most: int) -> Iterator[_Compared]:
+    some, bands = spread(np.arange(views.geometry.n_views), most), in_bands(views.geometry, grid)
     # Without bands of rows, groups of projections save memory.
-    groups = np.array_split(np.arange(some.size), 1 if views.geometry.rows_show_slices else min(some.size, _GROUPS))
-    sums, products, total = np.zeros((3, some.size)), np.zeros((4, 4)), 0.0
-    for n, (group, rows) in enumerate(((group, rows) for group in groups for rows in bands), 1):
-        geometry, part, slices = views.geometry.select(some[group]), grid, slice(None)
-        if len(bands) > 1:
-            slices = rows
-            _, geometry, part = part_of(geometry, grid, rows)
-        projector = Projector(geometry, part)
-        models = [projector.forward_lines(volume_lines(each.data[slices])) for each in volumes]
-        lines = views.data[some[group], rows].swapaxes(1, 2)
-        counts = np.isfinite(lines)
-        if views.weights is not None:
-            counts &= np.asarray(views.weights[some[group], rows] > 0).swapaxes(1, 2)
-        seen = at_voxel_resolution(np.where(counts, lines, np.float32(0)), projector.resolution, counts)
-        sums[:, group] += _summed(models[0] - seen, lines, counts)
-        if beside_uniform:
-            images = [_without_means(image, counts) for image in (seen, *models)]
-            products += [[np.vdot(one, other) for other in images] for one in images]
-            total += float(np.square(_without_means(lines, counts)).sum())
-        progress(n * some.size // (len(bands) * len(groups)), some.size)
-    return SquaresLeft(*sums), _along_rows(products, total) if beside_uniform else None
+    for places in np.array_split(np.arange(some.size), 1 if bands else min(some.size, _GROUPS)):
+        geometry = views.geometry.select(some[places])
+        for rows in _bands(views, some) if bands else [slice(0, geometry.detector_shape[0])]:
+            _, shown, slices = part_of(geometry, grid, rows) if bands else (rows, geometry, grid)
+            yield _Compared(shown, slices, rows, some[places], places)
 
 
-def _along_rows(products: F64, total: float) -> tuple[float, float]:
-    """The residuals along rows, from the products of the projections, the volume and the two uniform volumes."""
-    if total == 0:
-        return 0.0, 0.0
-    squares = products[0, 0] - 2 * products[0, 1] + products[1, 1]
-    norms = np.diag(products)[2:]
-    least = products[0, 0] - np.divide(products[0, 2:] ** 2, norms, out=np.zeros(2), where=norms > 0).max()
-    return math.sqrt(max(squares, 0.0) / total), math.sqrt(max(least, 0.0) / total)
+def _measured(views: Views, part: _Compared) -> tuple[F32, Mask, F32]:
+    """The measured lines [view, col, row], a mask of the lines that count, and the lines at the resolution of
+    voxels.
+    """
+    lines = views.data[part.views, part.rows].swapaxes(1, 2)
+    counts = np.isfinite(lines)
+    if views.weights is not None:
+        counts &= np.asarray(views.weights[part.views, part.rows] > 0).swapaxes(1, 2)
+    resolution = ViewResolution.of(part.geometry, part.grid)
+    return lines, counts, at_voxel_resolution(np.where(counts, lines, np.float32(0)), resolution, counts)
 
 
 def _without_means(lines: F32, known: Mask) -> F64:
@@ -145,19 +170,17 @@ def _without_means(lines: F32, known: Mask) -> F64:
     return np.where(known, values - values.sum(axis=1, keepdims=True) / n, 0)
 
 
-def _bands(views: Views, some: I64, grid: Grid) -> list[slice]:
+def _bands(views: Views, some: I64) -> list[slice]:
     """Bands of rows that represent the detector, at equal shares of the material that these projections show.
 
-    All rows if the detector is not large; one band if rows do not show slices.
+    All rows if the detector is not large.
     """
     rows, cols = views.geometry.detector_shape
-    bands = max(1, RAYS // (_ROWS * cols))
-    if not views.geometry.rows_show_slices or grid != Grid.matching(views.geometry):
-        return [slice(0, rows)]
-    if rows <= bands * _ROWS:
-        return [slice(first, min(first + _ROWS, rows)) for first in range(0, rows, _ROWS)]
+    bands = max(1, RAYS // (BAND * cols))
+    if rows <= bands * BAND:
+        return [slice(first, min(first + BAND, rows)) for first in range(0, rows, BAND)]
     matter = np.maximum(sum(np.nansum(views.data[view], axis=1, dtype=np.float64) for view in some), 0)
     reached = np.cumsum(matter if matter.any() else np.ones(rows))
     middles = np.searchsorted(reached, (np.arange(bands) + 0.5) / bands * reached[-1])
-    starts = np.unique(np.clip(middles - _ROWS // 2, 0, rows - _ROWS))
-    return [slice(first, first + _ROWS) for first in starts.tolist()]
+    starts = np.unique(np.clip(middles - BAND // 2, 0, rows - BAND))
+    return [slice(first, first + BAND) for first in starts.tolist()]

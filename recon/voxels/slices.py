@@ -15,10 +15,12 @@ from recon.base.volume import Grid
 from recon.voxels.fbp import continuation, continued, fbp, filter_projections
 from recon.voxels.view_weights import angular_weights, ray_weights
 
-_SIDE = 511  # largest side in voxels; wider projections are binned
-_VIEWS = 400  # most projections used, enough for this side; of more projections, some are left out, evenly by angle
+_SIDE = 511  # largest side of a slice in voxels; wider projections are binned
+# largest number of projections that are used, enough for this side. If there are more, some are left out, evenly by
+# angle.
+_VIEWS = 400
 _BRIGHT = 0.5  # share of the 99th percentile; the slices cross in the middle of the voxels above it
-_AT_ONCE = 32  # projections that are filtered together
+_AT_ONCE = 32  # number of projections that are filtered together
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +29,7 @@ class OrthogonalSlices:
 
     Attributes:
         images: float32 [y, x], [z, x] and [z, y], 1/mm.
-        at: z, y and x of the slices in mm.
+        at: z, y and x in mm of the point in which the slices cross.
         pixel: side of a voxel in mm.
         covered: radians of the 180° that the projections cover; π if no wedge is missing.
     """
@@ -41,7 +43,7 @@ class OrthogonalSlices:
 def orthogonal_slices(views: Sequence[F32], geometry: Geometry) -> OrthogonalSlices:
     """The middle slice perpendicular to the axis, and two slices along the axis through the middle of its bright part.
 
-    Each projection has a weight for its share of the 180°, so projections may come in any order. Only the slices are
+    Each projection is weighted by its share of the 180°, so projections may be in any order. Only the slices are
     back-projected. The time grows with the number of projections up to 400.
 
     Args:
@@ -49,7 +51,7 @@ def orthogonal_slices(views: Sequence[F32], geometry: Geometry) -> OrthogonalSli
         geometry: geometry of a parallel beam, without roll, tilt and shifts along the axis.
 
     Raises:
-        ValueError: there are fewer than two projections, or the geometry is another one.
+        ValueError: there are fewer than two projections, or the geometry is not of this kind.
     """
     if len(views) != geometry.n_views or len(views) < 2:
         raise ValueError(
@@ -100,11 +102,11 @@ def _along(data: F32, geometry: Geometry, points: F64) -> F32:
             filtered += continued(beyond, data[part], weights[part])
         columns = np.ascontiguousarray(filtered.transpose(0, 2, 1))
         for angle, shift, view in zip(geometry.angles[part], geometry.shifts[part, 0], columns, strict=True):
-            at = (points[0] * math.cos(angle) + points[1] * math.sin(angle)) / pitch
-            at += geometry.axis_col + shift + zeros[0]
-            low = np.clip(np.floor(at).astype(np.intp), 0, len(view) - 2)
-            near = (at - low).astype(np.float32)[:, None]
-            seen = ((at >= -0.5) & (at <= len(view) - 0.5)).astype(np.float32)[:, None]
+            cols = (points[0] * math.cos(angle) + points[1] * math.sin(angle)) / pitch
+            cols += geometry.axis_col + shift + zeros[0]
+            low = np.clip(np.floor(cols).astype(np.intp), 0, len(view) - 2)
+            near = (cols - low).astype(np.float32)[:, None]
+            seen = ((cols >= -0.5) & (cols <= len(view) - 0.5)).astype(np.float32)[:, None]
             np.clip(near, 0, 1, out=near)
             out += seen * ((1 - near) * view[low] + near * view[low + 1])
     return out

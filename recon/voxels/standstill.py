@@ -40,7 +40,9 @@ class Standstill:
         self._change, self._ended, self._done = math.inf, "bound", 0
 
     def ends(self, x: Any, done: int, going: bool) -> bool:
-        """Whether the sweeps end with the volume x [y, x, z] after `done` of them; `going`: they were not stopped."""
+        """Whether the sweeps end now. x [y, x, z] is the volume after `done` sweeps; `going` is True if the user has
+        not stopped them.
+        """
         self._done = done
         since = done - 1 - self._first
         if since >= 0 and since % MIRRORED == 0:
@@ -53,13 +55,15 @@ class Standstill:
         return not going
 
     def report(self) -> None:
-        """Record how the sweeps ended. The change of the sweeps before counts if that of these is not known."""
+        """Record how the sweeps ended. If the change of the last sweeps is not known, the change of the sweeps before
+        is recorded.
+        """
         before = self._decide.ended
         change = self._change if before is None or self._change < math.inf else before.change
         self._decide.ended = IterationEnd(self._ended, self._done, change, before and before.on_half_voxels)
 
     def _change_of(self, x: Any) -> float:
-        """Distance of the volume from that of the last call, divided by its norm; infinite at the first call."""
+        """Distance of the volume from the volume of the last call, divided by the norm; infinite at the first call."""
         device = self._device
         if self._before is None:
             self._before = device.copy(x)
@@ -72,8 +76,10 @@ class Standstill:
 
 
 def with_quality(method: MethodT, quality: Quality) -> MethodT:
-    """The method (with `still` and `iterations`) that ends nearer to the minimum, or farther from it for a preview."""
+    """A method with `still` and `iterations` changed for a preset: "best" ends nearer to the minimum, "preview" farther
+    from it.
+    """
     still, longer = _QUALITIES[quality]
     settings: Any = method
-    made: MethodT = replace(settings, still=still * settings.still, iterations=longer * settings.iterations)
-    return made
+    changed: MethodT = replace(settings, still=still * settings.still, iterations=longer * settings.iterations)
+    return changed

@@ -1,4 +1,4 @@
-"""Trial: test reconstructions from seven of every eight projections on some rows; they choose methods and priors.
+"""Trial: makes test reconstructions from seven of every eight projections on some rows, to choose methods and priors.
 
 A trial makes the volume of each candidate from the projections that are not held out. It measures the residual in each
 held-out projection, and compares candidates by the rule of `recon.voxels.choice`.
@@ -34,8 +34,9 @@ from recon.voxels.residuals import unseen_residuals
 from recon.voxels.standstill import MOST_SWEEPS
 from recon.voxels.voxel_problem import VoxelProblem, times_power
 
-_WIDE, _FEWEST_ROWS = 0.9, 4  # largest width of the field over that of a wide box; fewest rows of a trial in such a box
-TV_STEPS = 3  # dual steps of total variation in a trial, and in the voxel refinement of a fit
+# width of the field of view divided by that of a wide box, at most; fewest rows of a trial in such a box
+_WIDE, _FEWEST_ROWS = 0.9, 4
+TV_STEPS = 3  # dual steps of total variation, in a trial and in the voxel refinement of a fit
 _LEVELS_PREDICT = "discrete levels predict the held-out projections better"
 PATCH_STEPS = 35
 """Number of steps with sparse patches in a trial; also the default of `PnpDct`."""
@@ -49,9 +50,10 @@ def _share_in_field(geometry: Geometry, grid: Grid) -> float:
 def _is_wide(problem: VoxelProblem) -> bool:
     """Whether the sample is wider than the field of view, or the box is wider than the field by a tenth.
 
-    Then FBP is a poor first volume, because it does not contain the outside material, and later steps put this material
-    into the field. A disc three times as wide as the field had 1.16 to 1.32 times its density after twenty iterations
-    from FBP, and 0.97 to 0.98 times from an iteration of OS-SIRT.
+    In these cases FBP is a poor first volume, because it does not contain the outside material, and later steps put
+    this material into the field of view. For example, a disc three times as wide as the field of view had 1.16 to 1.32
+    times its density after twenty iterations that started from FBP, and 0.97 to 0.98 times if they started from an
+    iteration of OS-SIRT.
     """
     return problem.wide or _share_in_field(problem.projector.geometry, problem.projector.grid) <= _WIDE
 
@@ -105,10 +107,10 @@ def choose_patches(problem: VoxelProblem, weight: TvWeight, trial: Callable[[], 
     """The strength of `pnp_dct` chosen by held-out projections, starting from volumes of total variation with a weight
     μ.
 
-    Trials make as many steps as the volume will, because each step adds noise, so that fewer steps would prefer a
-    weaker prior. The search begins at the noise that a volume from all projections has without a prior. This is also
-    the strength if no projections can be held out; then total variation alone counts as equally good. The densest
-    material affects neither of them, so that weak material next to metal keeps its detail.
+    A trial makes as many steps as the volume will. Each step adds noise, so with fewer steps a weaker prior would win.
+    The search begins at the noise that a volume from all projections has without a prior. If no projections can be held
+    out, this noise is the strength, and total variation alone counts as equally good. The densest material does not
+    affect the noise or the strength, so weak material next to metal keeps its detail.
     """
 
     def chosen() -> list[float]:
@@ -132,8 +134,9 @@ class TrialSettings:
     """Settings of the run to which a trial belongs.
 
     Attributes:
-        all_rows: description of the rows, for a trial of all rows (a cone whose middle shows little material). Its
-            pixels may be binned, and then its priors are not valid for the volume. Empty: a trial of some rows.
+        all_rows: description of the rows if the trial uses all rows (a cone beam whose middle rows show little
+            material). Its pixels may be binned; then its priors are not valid for the volume. Empty: the trial uses
+            some rows.
         now: the clock.
         early: True: iterations as in a voxel refinement, which begins with a fit and ends early; False: until volumes
             have converged.
@@ -149,10 +152,10 @@ _USUAL = TrialSettings()
 
 @runtime_checkable
 class Predicting(Protocol):
-    """A method that finds out with a part of its work how well its volume predicts held-out projections."""
+    """A method that can determine with a part of its work how well its volume predicts held-out projections."""
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The prediction of its volume; `so_far` contains the predictions of simpler candidates."""
+        """The prediction of the method's volume. `so_far` contains the predictions of simpler candidates."""
 
 
 class AllColumns(NamedTuple):
@@ -179,8 +182,8 @@ class Trial:
             iteration of OS-SIRT.
         unseen: the held-out projections.
         all_columns: the same rows with all columns.
-        above: number of rows from the middle of all rows to the middle of the trial's; 0 for a cone, whose rows keep
-            their heights.
+        above: number of rows from the middle of all rows to the middle of the trial's rows. It is 0 for a cone beam,
+            because its rows keep their heights.
         smooth: the volume of total variation that predicts the held-out projections best so far.
         settings: settings of the run to which the trial belongs.
     """
@@ -263,7 +266,7 @@ class Trial:
 
     @property
     def ended(self) -> bool:
-        """Whether the trials were stopped; then no further volume is judged."""
+        """True if the trials were stopped. No further volume is then judged."""
         return not self._going.going
 
     def residuals_of(self, prior: str, strength: float, volume: Callable[[float], F32]) -> F64:
@@ -287,14 +290,14 @@ class Trial:
     def best_patches(self, weight: float, first: float, steps: int) -> BestStrength | None:
         """The strength of `steps` steps with patches after total variation, searched from `first`.
 
-        None: they were stopped.
+        None: the trials were stopped.
         """
         smooth = self.volume_of_weight(weight) if self.smooth is None else self.smooth
 
-        def made(strength: float) -> F32:
+        def volume_of(strength: float) -> F32:
             return self.volume_by(lambda part, first: pnp_dct(part, first, strength, steps=steps), smooth)
 
-        best = preferred_strength(lambda strength: self.residuals_of("patches", strength, made), first)
+        best = preferred_strength(lambda strength: self.residuals_of("patches", strength, volume_of), first)
         if best is not None:
             self._known["patches", best.strength] = best.residuals
         return best
@@ -320,7 +323,7 @@ class Trial:
     def early_weight(self) -> float | None:
         """The weight of total variation for a voxel refinement; it is larger, because the refinement ends early.
 
-        None: as `weight`.
+        None under the same conditions as for `weight`.
         """
         early = Trial.of(self.scan, replace(self.settings, early=True))
         return None if early is None else early.weight
@@ -329,8 +332,9 @@ class Trial:
     def wide(self) -> bool:
         """Whether the sample is wider than the field of view, or the box is wider than the field by a tenth.
 
-        Then patches are not tried. The outside material is in all projections. So patches have a lower residual in the
-        held-out projections although total variation is closer to the truth, by 0.4 and 0.6 dB for two samples.
+        In these cases patches are not tried. All projections contain outside material, so patches have a lower residual
+        in the held-out projections although total variation is closer to the ground truth (by 0.4 and 0.6 dB for two
+        samples).
         """
         return _is_wide(self.scan)
 
@@ -371,15 +375,15 @@ class Trial:
     def predicted(self, method: Method) -> Prediction:
         """The prediction of a method's own volume, made from the projections that are not held out."""
         views = self.views_of(method)
-        made = method.run(views, self.control)
-        return self.prediction(method.name, self.residuals(self.lines_of(made.volume)))
+        result = method.run(views, self.control)
+        return self.prediction(method.name, self.residuals(self.lines_of(result.volume)))
 
     def prediction(self, name: str, residuals: F64 | None, prior: Prior | None = None, remark: str = "") -> Prediction:
         """A prediction in the units of the scan; `prior` is in the units of the problem."""
         weighed = self.problem.weight is not None
         of_scan = None if prior is None or self.settings.all_rows else self.problem.units.prior(prior, weighed, 1)
-        left = None if residuals is None else self.in_line_integrals(residuals).tolist()
-        return Prediction(name, left, of_scan, remark)
+        values = None if residuals is None else self.in_line_integrals(residuals).tolist()
+        return Prediction(name, values, of_scan, remark)
 
     def in_line_integrals(self, residuals: F64) -> F64:
         """Residuals in the units of the scan, including the root of the weights."""
@@ -408,7 +412,7 @@ class Trial:
         return self.residuals_of("weight", weight, self.volume_of_weight)
 
     def residuals_of_patches(self, strength: float) -> F64 | None:
-        """Residuals for patches with this strength; None: it was not tried."""
+        """Residuals for patches with this strength; None: the strength was not tried."""
         return self._known.get(("patches", strength))
 
     def volume_of_weight(
@@ -430,7 +434,7 @@ class Trial:
         x = (self.start if start is None else start).copy()
         if self.ended:
             return x
-        return make(replace(self.problem, rng=np.random.default_rng(0)), x)  # the same order of subsets for all volumes
+        return make(replace(self.problem, rng=np.random.default_rng(0)), x)  # all volumes use the same order of subsets
 
     def residuals(self, x: F32, beyond: F32 | None = None) -> F64:
         """`unseen_residuals` of a volume [y, x, z]; infinite if the trials were stopped.

@@ -1,4 +1,4 @@
-"""VoxelProblem: the data of an iterative method on voxels, and parts that several methods share."""
+"""VoxelProblem: the data of an iterative method on voxels, and functions that several methods share."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def interleaved(projector: Projector, subsets: int) -> list[NDArray[np.intp]]:
 
 
 class Sweeps:
-    """Sweeps: passes over all projections, subset by subset. Memory: two volumes, and twice the projections.
+    """Makes sweeps: passes over all projections, subset by subset. Memory: two volumes, and twice the projections.
 
     Attributes:
         pace: typical step of a sweep along the gradient of the weighted ½||A x - p||².
@@ -58,14 +58,15 @@ class Sweeps:
         """Prepare sweeps over `data` [view, col, row] with `weight` for each ray (None: 1), in `subsets`."""
         (nz, ny, nx), device = projector.grid.shape, voxel_device(projector.device)
         self._device, self._parts, scales = device, list[tuple[LineProjector[Any], Any, Any, Any]](), 0.0
-        self._step = device.zeros((ny, nx, nz))  # largest column sums, then their inverse
+        self._step = device.zeros((ny, nx, nz))  # first the largest column sums, then their inverse
         self._gradient = device.zeros((ny, nx, nz))
         for views in subsets:
             part = projector.subset(views) if len(subsets) > 1 else projector
             measured = device.array(data[views] if len(subsets) > 1 else data)
             rays = None if weight is None else device.array(weight[views] if len(subsets) > 1 else weight)
             self._gradient[...] = 1
-            plain = projector_on(device, part.plain)  # sums of absolute values, except if a step is below 2
+            # the plain projector has no negative entries, so these are sums of absolute values
+            plain = projector_on(device, part.plain)
             scale = _inverse(plain.forward_lines(self._gradient))
             plain.adjoint_lines(
                 device.array(np.ones(scale.shape, np.float32)) if rays is None else rays, self._gradient
@@ -91,7 +92,7 @@ class Sweeps:
         volume = device.array(x)
         for index in order:
             part, data, weight, scale = self._parts[index]
-            residual = part.forward_lines(volume)  # the model; the data are subtracted next
+            residual = part.forward_lines(volume)  # first the model; the data are subtracted next
             some = slice(None, None, max(1, len(self._parts) * len(data) // _LOOKED_AT))
             weights_of_rays = None if weight is None else device.numpy(weight[some])
             seen.append(whitened(device.numpy(data[some] - residual[some]), weights_of_rays))
@@ -112,7 +113,7 @@ def whitened(residual: F32, weight: F32 | None) -> F32:
 
 
 def _inverse(sums: Any) -> Any:
-    """1 / sums, or 0 if they are too small; the array, of any device, is overwritten."""
+    """1 / sums, or 0 if a sum is too small. The array is overwritten; it may be on any device."""
     least = max(_LEAST_SUM * float(sums.max()), float(np.finfo(np.float32).tiny))
     sums[sums <= least] = math.inf
     return 1 / sums
@@ -149,7 +150,7 @@ class Units(NamedTuple):
     def prior(self, prior: Prior, weighed: bool, sign: int = -1) -> Prior:
         """The prior in these units, for rays with (`weighed`) or without weights.
 
-        With sign 1, back in those of the scan.
+        With sign 1, the prior is converted back to the units of the scan.
         """
         weight = math.ldexp(prior.weight, sign * (self.length + self.integral + weighed * self.weight))
         materials = prior.materials and prior.materials.scaled(sign * self.density)
@@ -170,8 +171,8 @@ def times_power(array: F32, power: int) -> F32:
     return array
 
 
-NORM = "norm"  # name of the decision on the largest eigenvalue, which does not depend on the data
-POWER_ROUNDS = 6  # rounds of the power iteration
+NORM = "norm"  # name of the decision about the largest eigenvalue, which does not depend on the data
+POWER_ROUNDS = 6  # number of rounds of the power iteration
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +210,9 @@ class VoxelProblem:
 
     @property
     def norm(self) -> float:
-        """`largest_eigenvalue` of AᵀWA with all columns, computed once for copies with this projector and weight."""
+        """The `largest_eigenvalue` of AᵀWA with all columns. It is computed once for all copies with this projector and
+        weight.
+        """
         for projector, weight, norm in self._norms:
             if projector is self.projector and weight is self.weight:
                 return norm
@@ -370,7 +373,7 @@ def bytes_of(buffers: Buffers, geometry: Geometry, grid: Grid, weighted: bool = 
     """Size of these buffers in bytes for some projections and voxels; weights count only if rays are `weighted`."""
     n_rays = geometry.n_views * math.prod(geometry.detector_shape)
     wide = max(geometry.detector_shape[1], grid.shape[2])
-    volumes = buffers.volumes + (geometry.width.arc > 0)  # for the angles within an exposure
+    volumes = buffers.volumes + (geometry.width.arc > 0)  # for the angles within one exposure
     rays = buffers.rays + bool(geometry.width) + bool(ViewResolution.of(geometry, grid).smoothed.any())
     rays += buffers.weights * weighted
     beside = fbp_memory(geometry.n_views, wide) if buffers.filtered else 0
@@ -382,7 +385,8 @@ def difference_weights(grid: Grid) -> tuple[float, float, float]:
     return 1.0, 1.0, grid.voxel_size / grid.spacing[0]
 
 
-_BACK = (0, 0), (1, 0), (0, 1), (1, 1)  # the four mirror images, without reflections in a point
+# the mirror images of the differences along y and x, without reflections in a point
+_BACK = (0, 0), (1, 0), (0, 1), (1, 1)
 
 
 class TotalVariationProx:

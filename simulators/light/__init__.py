@@ -16,12 +16,13 @@ NEAREST, FARTHEST = 1e-6, 1e9
 
 @dataclass(frozen=True)
 class Tube:
-    """An X-ray tube: the bremsstrahlung of a thick target, (kv - E) / E photons an energy interval at E (Kramers, Phil.
-    Mag. 46, 836, 1923), behind filters. It has no characteristic lines; to include them give the spectrum as a table.
+    """An X-ray tube: the bremsstrahlung of a thick target behind filters, with (kv - E) / E photons per energy interval
+    at E (Kramers, Phil. Mag. 46, 836, 1923). Characteristic lines are not included; to include them, give the spectrum
+    as a table.
 
     Attributes:
-        kv: the voltage, and the highest energy in keV.
-        filters: mm of each material in the beam; {Al: 1.0, Cu: 0.1}.
+        kv: the voltage in kV, which is also the highest energy in keV.
+        filters: thickness in mm of each filter in the beam, such as {Al: 1.0, Cu: 0.1}.
     """
 
     kv: Annotated[float, Setting(ge=5, le=800)]
@@ -30,11 +31,11 @@ class Tube:
 
 @dataclass(frozen=True)
 class Beam:
-    """A parallel beam, or a cone where the distances are given.
+    """A parallel beam, or a cone beam if the distances are given.
 
-    Its energies affect materials only: a grey solid attenuates all energies equally. Weights are shares of the photons
-    detected in the open beam, so that `photons_per_s` has the same meaning for any spectrum. The detector's response to
-    energies is part of the weights.
+    The energies affect materials only: a grey solid attenuates all energies equally. Weights are shares of the photons
+    detected in the open beam, so that `photons_per_s` has the same meaning for any spectrum. The response of the
+    detector to each energy is part of the weights.
 
     Attributes:
         photons_per_s: number of photons that each (unbinned) sensor pixel detects per second in the open beam.

@@ -1,4 +1,6 @@
-"""Phantoms: builds the sample that a scene's mapping names; a kind's module is imported only if it is named."""
+"""Phantoms: builds the sample that the mapping of a scene names. The module of a kind of sample is imported only if a
+scene names this kind.
+"""
 
 from __future__ import annotations
 
@@ -45,9 +47,9 @@ CANDIDATES, ROUNDS = 256, 40
 
 @dataclass(frozen=True)
 class Battery:
-    """Arguments of `battery` and the seed of its generator, as keys of a scene.
+    """The keys of a scene for `battery`: its arguments, and the seed of its random generator.
 
-    5000 particles take a minute, and the work grows as their square.
+    With 5000 particles the work takes a minute. It grows with the square of the number of particles.
     """
 
     field_of_view: tuple[Millimetres, Millimetres]
@@ -74,8 +76,8 @@ def battery(
     """Solids of a cylindrical cell that fits into the field of view, with air on all sides.
 
     Half of the particles are ellipsoids, a third octahedra and the rest boxes (the habits of LiCoO2 crystals), in any
-    orientation. Their sizes are log-normal. A particle's attenuation is its contrast to the electrolyte. The wall is a
-    cylinder and its bore, a cylinder with the negative attenuation.
+    orientation. Their sizes are log-normal. A particle's attenuation is its contrast to the electrolyte. The wall
+    consists of two solids: a cylinder, and its bore, which is a cylinder with the negative attenuation.
 
     Args:
         field_of_view: (width, height) in mm.
@@ -83,7 +85,7 @@ def battery(
         fill: share of the electrolyte's volume that spheres of the particles' median radius would take.
 
     Raises:
-        ValueError: too little room for the particles.
+        ValueError: there is too little space for the particles.
     """
     width, height = field_of_view
     radius, inside, tall = 0.44 * width, 0.95 * 0.44 * width, 0.9 * height
@@ -101,7 +103,9 @@ def battery(
 
 
 def _particle(rng: np.random.Generator, size: float, attenuation: float) -> tuple[Ellipsoid | Polyhedron | Box, float]:
-    """A particle at the origin and the radius of the sphere around it; `size` is about the particle's radius in mm."""
+    """A particle at the origin, and the radius of the sphere around it. `size` is about the radius of the particle in
+    mm.
+    """
     kind = rng.choice(3, p=(1 / 2, 1 / 3, 1 / 6))
     a, b, c = (size * rng.uniform(0.8, 1.2, 3)).tolist()
     w, x, y, z = rng.normal(size=4).tolist()
@@ -117,11 +121,11 @@ def _particle(rng: np.random.Generator, size: float, attenuation: float) -> tupl
 def _place(
     rng: np.random.Generator, reach: NDArray[np.float64], radius: float, half_height: float, gap: float
 ) -> NDArray[np.float64]:
-    """Centres (x, y, z) [n, 3] of spheres with `gap` between each other and to the wall: random sequential addition in
-    the given order (the largest first fill best).
+    """Centres (x, y, z) [n, 3] of spheres with a distance of `gap` from each other and from the wall. The method is
+    random sequential addition in the given order; with the largest spheres first, most spheres fit.
 
     Raises:
-        ValueError: one of them finds no room.
+        ValueError: there is no space for one of the spheres.
     """
     centres = np.empty((reach.size, 3))
     for i, own in enumerate(reach):
@@ -146,11 +150,11 @@ def build_sample(where: str, entry: Any, beam: Beam, read: ReadVolume | None = N
 
     Args:
         where: path of the entry, for messages.
-        beam: its energies decide how materials attenuate.
-        read: reads the file of a volume; None: the sample cannot be a volume.
+        beam: the beam, whose energies decide how materials attenuate.
+        read: function that reads the file of a volume; None: the sample cannot be a volume.
 
     Raises:
-        SceneError: an unknown kind, a wrong value, or a sample that cannot be built.
+        SceneError: the kind is unknown, a value is wrong, or the sample cannot be built.
     """
     kind, mapping = named(where, list(_KINDS), entry)
     where = f"{where} ({kind})"
@@ -173,7 +177,7 @@ class _Keys:
 
 
 def _solids(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
-    """The sample of the `solids` of a phantom. It is grey if no key needs the module of another folder."""
+    """The sample of the `solids` of a phantom. The sample is grey if no key needs the module of another folder."""
     keys = build(_Keys, where, mapping)
     entries = [(f"{where}.solids[{i}]", entry) for i, entry in enumerate(keys.solids or ())]
     used = {*mapping, *(key for _, entry in entries if isinstance(entry, Mapping) for key in entry)}

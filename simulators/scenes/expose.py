@@ -1,7 +1,7 @@
 """Exposures of a scene: a single frame, and all frames of a scan with the scene's own settings.
 
-A frame is computed from the rotating sample to counts, with only the effects that the scene names. A scan has darks,
-then flats, then projections.
+A frame is computed from the rotating sample to the counts. Only the effects that the scene names are applied. A scan
+has darks, then flats, then projections.
 
 Without effects a frame is photons x exposure x exp(-line integral) / conversion, rounded: Beer-Lambert.
 """
@@ -39,7 +39,7 @@ class Scan:
     Attributes:
         seed: seed of all random numbers. start: time of the first frame, s since the Unix epoch. views: number of
             projections, spread over the range of the scene. In a fly scan with fewer projections, periods are longer.
-            The speed of the stage stays, so each projection has the blur of the scene.
+            The speed of the stage does not change, so each projection has the blur of the scene.
     """
 
     scene: Scene
@@ -173,7 +173,9 @@ def _transmission(
     times: NDArray[np.float64],
     open_beam: float,
 ) -> Image:
-    """open_beam x exp(-line integral) with the sample's pose at one moment of each row, mean over a pixel's rays."""
+    """The intensity open_beam x exp(-line integral), with the pose of the sample at one moment for each row, averaged
+    over the rays of a pixel.
+    """
     pose = scene.chain.pose(Pose(angles), times, shot)
     pose = pose.shifted_by((shot.aside, 0.0, 0.0)) if shot.aside else pose
     now, rays = shot.later(float(times[0])), scene.chain.rays

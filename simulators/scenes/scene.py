@@ -83,11 +83,11 @@ class Scene:
     """Sample, beam and effects.
 
     Attributes:
-        sample: in the beam.
-        beam: the light.
-        chain: the effects in order; without any a frame is exactly Beer-Lambert.
+        sample: the sample in the beam.
+        beam: the beam.
+        chain: the effects in order. Without effects, a frame follows Beer-Lambert exactly.
         axis_offset_px: columns by which the rotation axis lies right of the sensor's middle, in sensor pixels.
-        detector, scan: settings of `beamline simulate`; a configured run has its own.
+        detector, scan: settings for `beamline simulate`; a configured run has its own settings.
     """
 
     sample: Sample
@@ -117,7 +117,7 @@ def load_scene(mapping: Mapping[str, Any], read: ReadVolume | None = None) -> Sc
         read: reads the file of a volume; None: the sample cannot be a volume.
 
     Raises:
-        SceneError: an unknown or missing key, a wrong value, or a wrong order of effects.
+        SceneError: a key is unknown or missing, a value is wrong, or the order of the effects is wrong.
     """
     keys = build(_SceneKeys, "scene", mapping)
     effects = []

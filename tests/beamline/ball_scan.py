@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from beamline.config import load as config
-from beamline.config.load import camera_settings
 from beamline.config.models import Config
+from beamline.config.planned import camera_settings
 from beamline.instrument import connect as devices
 from beamline.plan.plan import Block
 from beamline.plan.timeline import passes

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from beamline.config.load import Config, plan_of
+from beamline.config.load import Config
+from beamline.config.planned import plan_of
 from beamline.plan.passes import Choice, Passes
 from beamline.plan.plan import ScanPlan
 from beamline.scan.preflight import preflight

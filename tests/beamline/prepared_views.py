@@ -14,7 +14,7 @@ from beamline.core.sinks import Warn
 from beamline.projections.correction import ScanCorrectionPlan
 from beamline.projections.growing import FedCorrection, feed
 from beamline.projections.prepare import DiskBuffer, prepare_projections
-from beamline.projections.prepared import Corrected, PreparedProjections
+from beamline.projections.prepared import Corrected, PreparedProjections, ScanOrigin
 from beamline.projections.selection import Selection
 from beamline.projections.views import select
 from beamline.storage.readers.open import SourceOptions
@@ -56,6 +56,5 @@ def prepared_views(
     masked = np.zeros(geometry.detector_shape, np.bool_)
     whole = Projections(data, np.arange(n), 0.0, np.ones(n, np.float32), masked, weights=weights)
     lines = Views(data, geometry, weights, np.arange(n))
-    return PreparedProjections(lines, Corrected.of(whole), geometry.axis_col, None, **{
-        "n_projections": n, "length_unit": "mm", "quantity": "counts", **more
-    })  # fmt: skip
+    origin = ScanOrigin(geometry.axis_col, None, n, "mm", "counts")
+    return PreparedProjections(lines, Corrected.of(whole), origin, **more)

@@ -96,9 +96,9 @@ def test_an_axis_is_found_or_kept_by_views_held_out(tmp_path: Path, stated: floa
     with open_scan(path) as source:
         prepared = prepare_projections(select(source, PLAIN), warnings.append)
         given = prepare_projections(select(source, replace(PLAIN, axis_col=20.2)), _never)
-    assert prepared.axis_col == pytest.approx(AXIS, abs=0.05)
-    assert stated == AXIS or (prepared.axis is not None and prepared.axis.confident)
-    assert given.axis_col == 20.2
+    assert prepared.origin.axis_col == pytest.approx(AXIS, abs=0.05)
+    assert stated == AXIS or (prepared.origin.axis is not None and prepared.origin.axis.confident)
+    assert given.origin.axis_col == 20.2
     assert len(warnings) == len(told) and all(words in warning for words, warning in zip(told, warnings, strict=True))
 
 

@@ -13,7 +13,7 @@ from beamline.config.beam import StageOutputShutter
 from beamline.config.devices import DcamOrca
 from beamline.config.load import config_folder, load
 from beamline.config.stages import STAGE_SECTIONS
-from beamline.scan.preflight import dry_run
+from beamline.scan.dry_run import dry_run
 
 TEXT = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text(encoding="utf-8")
 DEVICES: dict[str, tuple[type[BaseModel], ...]] = {

@@ -22,7 +22,7 @@ from beamline.plan.choose import ScanTarget, choose, options, remaining_gain
 from beamline.plan.passes import Choice, Passes, pass_blocks
 from beamline.plan.plan import Block
 from beamline.plan.timeline import block_seconds
-from beamline.scan.preflight import DryRun, dry_run
+from beamline.scan.dry_run import DryRun, dry_run
 from drivers.base.frame import FrameKind
 from recon.base.error_law import ErrorLaw
 from tests.bench.next_pass import WISH, ScoreFile, State, fixed, hindsight, whole_plan

@@ -69,7 +69,8 @@ def test_bands_of_rows_stand_for_a_large_detector(monkeypatch: pytest.MonkeyPatc
     wrong = Volume(flat.data * np.linspace(0.8, 1.0, 24, dtype=np.float32), ball.grid)
     whole = judge(wrong, views).figures["residual"]
     monkeypatch.setattr(residuals, "RAYS", 4 * 16 * 24)
-    assert residuals.left_by_volume(wrong, views, 3, lambda *_: None)[0].rays.tolist() == [4 * 16 * 24] * 3
+    banded, _ = residuals.residual(wrong.grid, views, 3).alone(wrong, views.geometry)
+    assert banded.rays.tolist() == [4 * 16 * 24] * 3
     assert judge(wrong, views).figures["residual"] == pytest.approx(whole, rel=1e-5)
 
 
@@ -82,5 +83,5 @@ def test_looks_for_which_there_is_no_time_are_named() -> None:
         "the check for mass where projections show no material",
         "the check for projections that do not fit the volume",
     )
-    assert found.stray is None and found.seconds_of_views == pytest.approx(20 / 16 / 3)
+    assert found.stray is None and found.seconds_of_views == pytest.approx(20 / 16 / 2)
     assert judge(ball, views, aspects=Aspect.STRAY).skipped == ()

@@ -118,6 +118,6 @@ def test_a_view_that_differs_is_found_among_leaning_ones(cone: bool, rng: np.ran
     geometry = leaning(cone)
     data = rays(geometry) + rng.normal(0, 0.003, (32, 32, 38)).astype(np.float32)
     truth = recon.Volume(smooth_ball(GRID, AXES, CENTRE), GRID)
-    assert odd_views(truth, Views(data, geometry)) == ()
+    assert odd_views(truth.grid, Views(data, geometry)).alone(truth, geometry) == ()
     data[11, 10:20, 14:24] += 0.1
-    assert [odd.view for odd in odd_views(truth, Views(data, geometry))] == [11]
+    assert [odd.view for odd in odd_views(truth.grid, Views(data, geometry)).alone(truth, geometry)] == [11]

@@ -148,7 +148,7 @@ def _compare(
         facts = facts_of(source)
         selection = Selection(axis_col=float(str(record.parameters["axis_col"])))
         prepared = prepare_projections(select(source, selection), warnings.append)
-        prepared = replace(prepared, axis=axis_of(record.parameters))
+        prepared = prepared.stating(axis=axis_of(record.parameters))
     grid = Grid.matching(prepared.geometry)
     ideal = truth(grid)
     made = Reconstruction(

@@ -162,7 +162,7 @@ class SweptScan(TrialScan):
                 prepared = prepare_projections(select(source, wanted), Warnings(self._sink, self._clock))
             views = hold_out(prepared, ONE_IN, advice="take a scan with more projections").views
             if wanted.axis_col is None and source_words == self._first:
-                self._axis = prepared.axis_col
+                self._axis = prepared.origin.axis_col
                 wanted = replace(wanted, axis_col=self._axis)
             self._views = source_words, wanted, views
         return self._views[2]

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import rotate
 
-from beamline.config.load import Config, plan_of
+from beamline.config.load import Config
+from beamline.config.planned import plan_of
 from beamline.core.errors import ConfigError, QualityError
 from beamline.core.events import Sink
 from beamline.core.stop import StopRequest

@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.config.load import Config, camera_settings, plan_of
+from beamline.config.load import Config
 from beamline.config.monitor import reference_limits
+from beamline.config.planned import camera_settings, plan_of
 from beamline.core.errors import InstrumentError
 from beamline.core.events import Sink
 from beamline.core.stop import StopRequest

@@ -37,8 +37,9 @@ CONE = 1.4
 OFF_MIDDLE = 0.05  # range of the axis, as a share of the field of view, if the axis is not stated
 # smallest difference of the squares of score and rival: 6 standard deviations, more than a search finds in noise
 UNLIKELY = 36.0
-RIVAL = 0.85  # of the score, at most: both grow with the depth, and so does what either misses
-UNEVEN = 2.5  # mean square deviation from one depth, at most; of noise 1, in a few steps up to 2
+# largest share of the score: both scores grow with the depth, and so does the part that either of them misses
+RIVAL = 0.85
+UNEVEN = 2.5  # largest mean square deviation from a constant depth; it is 1 for noise, and up to 2 in a few steps
 NEAR = 3.0  # largest distance in cells between two tracks of the same particle
 BOX = 3.0  # distance in cells from the middle of a particle to the edges of its region
 HALF = 0.5  # share of the depth above which a row belongs to the particle

@@ -30,12 +30,12 @@ FREQUENCIES = 120  # number of frequencies, up to Nyquist, over which the covari
 ROUGHNESS = 0.05
 CONSTANT = 1.0  # variance of constant differences, such as rings or flats that do not match
 COLUMNS = 32  # number of broad columns in the field of view
-PARTS = 8  # of the rows
+PARTS = 8  # parts of the rows
 MOST_PARTS = 25.0  # percentile of the parts that must show the change
 # share of the mean that these parts must have: a moving shadow is as high as the frame, a particle is only in some
 # parts
 ALIKE = 0.25
-LAGS = (-4, -3, -2, -1, 0)  # times the stride
+LAGS = (-4, -3, -2, -1, 0)  # factor on the stride
 # rad: 3 projections at steps of 0.2 degrees; while the sample rotates by four times this angle, its points move on
 # nearly straight lines
 SWEEP = 0.0105
@@ -46,8 +46,9 @@ STRUCTURE, COMMON = 0.3, 0.05**2
 MARGIN = 1.2
 WIDER = 2.2  # the same as for a loose particle
 FASTER = 1.3
-SHOWS = 4.0  # if a hump at the limit does not reach this many standard deviations, its filter is left out
-CALIBRATION = 24  # views
+# if the output for a shadow at the limit is below this number of standard deviations, this filter is left out
+SHOWS = 4.0
+CALIBRATION = 24  # projections
 LEAST_NOISE = 3e-4
 MEMORY, OUTLIER = 0.03, 3.0
 PEAK = 5.0

@@ -1,1 +1,1 @@
-"""Corrections of projections, one per file; `registry` has a line for each."""
+"""Corrections of projections. Each correction has its own file and a line in `registry`."""

@@ -28,18 +28,20 @@ if TYPE_CHECKING:
     from recon.prep.background import AirSums, Background
     from recon.prep.counts_plan import CorrectionSettings
 
-_VOXELS, _VIEWS = 2**20, 180  # upper limits for the volume that shows where the sample is
-# voxels around the sample that are left out, for each round. An uneven beam piles up there until the second round,
-# before which most of the background was subtracted
+_VOXELS, _VIEWS = 2**20, 180  # upper limits of the size of the volume that shows where the sample is
+# voxels around the sample that are left out in each round. An uneven beam appears there until the second round, before
+# which most of the background is subtracted.
 _RIMS = 6.0, 1.5
-_COPIES = 6  # float32 copies of the volume
-_TERMS, _SUMS = 40, 800  # float64 numbers per binned pixel, and per projection
-_AT_ONCE, _NOISE_VIEWS = 64, 16  # projections
+_COPIES = 6  # number of float32 copies of the volume
+_TERMS, _SUMS = 40, 800  # number of float64 values per binned pixel, and per projection
+_AT_ONCE, _NOISE_VIEWS = 64, 16  # fewest projections
 _LEAST_VIEWS, _WIDEST_GAP = 12, np.radians(30)
 
 Columns = Literal["none", "auto"] | tuple[int, int]
 Surface = Literal["auto", "none"] | int
-"""The surface that is taken off as the background of the beam: by its order, or "auto" where the views confirm it."""
+"""Value of the option for the surface that is subtracted as background of the beam: the order of the surface, or "auto"
+to subtract it if the projections confirm it.
+"""
 
 _MODELS: dict[str, tuple[Columns, Surface]] = {
     "auto": ("auto", "auto"), "columns": ("auto", "none"), "none": ("none", "none"),
@@ -88,8 +90,8 @@ class Air:
     )
 
     def settings(self, before: CorrectionSettings) -> CorrectionSettings:
-        """These settings with the columns of air, and the line integral above which edges count as sample, as in the
-        monitor. Columns that the user states always count as air.
+        """These settings with the air columns, and with the line integral above which edges count as sample (as in the
+        monitor). Columns that the user states always count as air.
         """
         from recon.base.reach import LEAST
 
@@ -136,7 +138,7 @@ def background_memory(geometry: Geometry) -> int:
 
 
 class _Views:
-    """Line integrals [view, row, col] with their geometry, binned and finite, read N at a time."""
+    """Yields line integrals [view, row, col], binned and finite, with their geometry; N projections at a time."""
 
     def __init__(self, data: F32, geometry: Geometry, unknown: Mask | None) -> None:
         self.data, (rows, cols) = data, geometry.detector_shape
@@ -172,16 +174,16 @@ def without_background(
 ) -> tuple[str, F64 | None]:
     """Subtract the background of the beam from projections, in place.
 
-    Returns what was done, in words (empty: nothing), and the coefficients of the mean surface that was subtracted.
+    Returns what was done in words (empty: nothing was done), and the coefficients of the mean subtracted surface.
 
     Args:
         surface: "auto": subtract it if the projections confirm it; a number: polynomials of this order.
         others: further projections, from which the same background is subtracted.
         unknown: bool [row, col], pixels that were not measured.
-        levelled: line integral of the air at the edges that was already subtracted, the mean of the projections.
+        levelled: line integral of the air at the edges that was already subtracted, mean over the projections.
 
     Raises:
-        DataError: polynomials were asked for, and too few rays miss the sample.
+        DataError: polynomials were requested, but too few rays miss the sample.
     """
     from recon.base.noise import noise_level
     from recon.voxels.beyond_field import reach_of
@@ -191,7 +193,7 @@ def without_background(
     order = None if surface == "auto" else surface
     data = of_scan.data
     views = _Views(data, of_scan.geometry, unknown)
-    fills_field = reach_of(of_scan).beyond  # such a sample looks like air
+    fills_field = reach_of(of_scan).beyond  # such a sample would look like air
     shows_air = _see_all_sides(of_scan.geometry) and not fills_field
     fitted, where = _fitted(views, order) if shows_air else (None, None)
     if fitted is None or where is None:
@@ -204,8 +206,8 @@ def without_background(
     if order is None and not fitted.confirmed(noise_level(views.binned(spread(np.arange(len(data)), _NOISE_VIEWS)))):
         return "", None
     seen = _described(fitted, levelled)
-    # With the line subtracted, the projections are brighter than their flats inside the sample's outline: then it is
-    # the beam that changed.
+    # If the line is subtracted and the projections are then brighter than their flats inside the sample's outline, the
+    # beam has changed.
     if order is None and fitted.level > 0 and fitted.level + levelled > 0:
         return (
             "The background of the beam was not subtracted, because it is positive and may be weakly "
@@ -226,7 +228,7 @@ def without_background(
 
 
 def _described(fitted: Background, levelled: float) -> str:
-    """The fitted polynomial in words, and the line that was subtracted before the fit."""
+    """A sentence about the fitted polynomial, and about the line that was subtracted before the fit."""
     from recon.prep.background import LEAST_SIZE
 
     before = ""
@@ -248,7 +250,7 @@ def _see_all_sides(geometry: Geometry) -> bool:
 
 
 def _fitted(views: _Views, order: int | None) -> tuple[Background | None, tuple[Mask, Grid]]:
-    """The background of all projections, and the first volume of some of them that shows where the sample is."""
+    """The background of all projections, and a first volume from some projections, which shows where the sample is."""
     from recon.prep.background import matter
     from recon.splatting.initialise import first_volume
 
@@ -264,7 +266,7 @@ def _fitted(views: _Views, order: int | None) -> tuple[Background | None, tuple[
         if fitted is not None:
             fitted.remove(levelled, factor=views.factor)
         inside = away <= geometry.reach - rim * grid.voxel_size
-        if not inside.any():  # a detector of a few columns has no voxel inside
+        if not inside.any():  # a detector with a few columns has no voxel inside the sample
             return None, (np.zeros(grid.shape, np.bool_), grid)
         sample = matter(first_volume(levelled, some, grid).data, inside)
         fitted = views.sums(sample, grid, np.arange(n) if last else numbers).fit(order)

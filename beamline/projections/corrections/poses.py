@@ -1,5 +1,5 @@
-"""Poses of projections from a file: displacement, roll and tilt, or vectors, become geometry. Projections are not
-resampled.
+"""Poses of projections from a file (displacement, roll and tilt, or vectors) become a part of the geometry. Projections
+are not resampled.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from recon.base.arrays import F64, I64
     from recon.base.geometry import Geometry
 
-_SAME_SIZE = 0.01  # of a pixel
-_OFF = 0.25  # of the step between two projections: an angle that differs by more belongs to another projection
+_SAME_SIZE = 0.01  # share of a pixel
+_OFF = 0.25  # share of the step between two projections: an angle that differs by more belongs to another projection
 
 
 def _table(text: str) -> PoseTable:
@@ -42,7 +42,8 @@ class PosesOfFile:
     """Displacement, roll and tilt of the projections, as stated by a file.
 
     Attributes:
-        table: the file's; None: projections are displaced as the scan file states (.txrm), or not at all.
+        table: the poses in the file of the option; None: projections are displaced as the scan file states (.txrm), or
+            not at all.
     """
 
     name: ClassVar[str] = "poses"
@@ -78,7 +79,7 @@ class PosesOfFile:
 
 
 def stated_poses(scan: SelectedScan) -> PoseTable | None:
-    """The poses in the option's file, or else the shifts stated by the scan file."""
+    """The poses in the file of the option; without the option, the shifts in the scan file."""
     from beamline.storage.pose_table import PoseTable
 
     source = scan.source
@@ -98,16 +99,17 @@ class ScanPoses:
 
     Attributes:
         table: the poses as the file states them.
-        shifts: float64 [frame, 2], (col, row) in pixels of the unbinned detector, NaN if the file states none.
+        shifts: float64 [frame, 2], (col, row) in pixels of the unbinned detector; NaN for a frame without a stated
+            shift.
         roll, tilt: float64 [frame], radians.
         frames: int64 [view], the rows that are used.
-        sentence: in a line, what was read.
+        sentence: a sentence that says what was read.
         pivot: row of the detector about which projections are rolled and tilted, binned and counted from the first
             one used.
-        binning: of the detector's pixels.
+        binning: binning of the detector's pixels.
         vectors: the geometry that the file states for its projections, in the rows and with the binning used; None:
             the file has no vectors.
-        view_of: int64 [frame], index of the frame in `vectors`; -1: none.
+        view_of: int64 [frame], index of the frame in `vectors`; -1: the frame has no vector.
     """
 
     table: PoseTable
@@ -150,10 +152,10 @@ class ScanPoses:
 
 
 def poses_of(scan: SelectedScan, frames: I64) -> ScanPoses | None:
-    """The poses of `frames` from the selection's file, or else from the scan file; None if neither states any.
+    """The poses of `frames` from the file of the selection, otherwise from the scan file. None if neither states poses.
 
     Raises:
-        ConfigError: options that exclude each other.
+        ConfigError: options exclude each other.
         DataError: the file does not fit the scan; the message says why.
     """
     table, source, selection = stated_poses(scan), scan.source, scan.selection
@@ -173,7 +175,7 @@ def poses_of(scan: SelectedScan, frames: I64) -> ScanPoses | None:
     shifts = table.shifts * _pixels(table, scan)
     rows = _rows(table, source, frames)
     height, width = source.shape
-    # offset projections are displaced by a few fields of view
+    # the displacement of offset projections is at most a few fields of view
     if (far := (np.abs(shifts) >= (8 * width, height)).any(axis=1)).any():
         row = int(np.flatnonzero(far)[0])
         raise DataError(
@@ -219,7 +221,7 @@ def _of_vectors(table: PoseTable, scan: SelectedScan) -> Geometry:
 
 
 def _pixels(table: PoseTable, scan: SelectedScan) -> float:
-    """Pixels of the unbinned detector in the table's unit."""
+    """Size of a pixel of the unbinned detector in the unit of the table."""
     if table.unit == "px":
         return 1.0
     if scan.selection.cone is not None:
@@ -237,7 +239,9 @@ def _pixels(table: PoseTable, scan: SelectedScan) -> float:
 
 
 def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
-    """[frame of the scan] its row in the table; -1: none. Angles that both state must agree."""
+    """[frame of the scan] row of the frame in the table; -1: the table has no such row. If the scan and the table both
+    state an angle, the angles must agree.
+    """
     n, views = len(source.table), source.table.views
     if table.frames is not None and table.frames != n:
         raise DataError(
@@ -267,11 +271,11 @@ def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
             both = frames[row_of_frame[frames] >= 0]
             off = np.abs(table.angles_deg[row_of_frame[both]] - degrees[both])
             if (off > tolerance).any():
-                at = int(both[off > tolerance][0])
-                stated = table.angles_deg[row_of_frame[at]]
+                frame = int(both[off > tolerance][0])
+                stated = table.angles_deg[row_of_frame[frame]]
                 raise DataError(
-                    f"{table.path} states frame {at} at {stated:.6g} degrees, but {source.path} at "
-                    f"{degrees[at]:.6g}; expected the poses of the same scan."
+                    f"{table.path} states frame {frame} at {stated:.6g} degrees, but {source.path} at "
+                    f"{degrees[frame]:.6g}; expected the poses of the same scan."
                 )
     return row_of_frame
 

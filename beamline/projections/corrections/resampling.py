@@ -1,4 +1,4 @@
-"""Resampling: corrects the in-plane tilt of the axis and the distortion of the lens in one interpolation of the
+"""Resampling: corrects the in-plane tilt of the axis and the distortion of the lens with a single interpolation of the
 projections.
 """
 
@@ -27,14 +27,15 @@ if TYPE_CHECKING:
     from recon.prep.projections import Projections
 
 _MOST_TILT_DEG = 45.0
-_BANDS, _BAND_ROWS, _VIEWS = 16, 4, 240  # bands of rows, rows of each, and projections that --tilt auto uses
-_NOTHING = 0.05  # px over the rows; a smaller tilt is not worth an interpolation
+# number of bands of rows, rows of each band, and number of projections that --tilt auto uses
+_BANDS, _BAND_ROWS, _VIEWS = 16, 4, 240
+_NOTHING = 0.05  # px over the rows: a smaller tilt is not worth an interpolation
 _ROUNDS = 5
-_COPIES = 20  # float32 copies of all bands while their axes are searched for
+_COPIES = 20  # number of float32 copies of all bands while their axes are searched for
 
 
 def _tilt(text: str) -> float | str:
-    """An angle within 45 degrees, or "auto"."""
+    """Parse the option: an angle within 45 degrees, or "auto"."""
     if text == "auto":
         return text
     try:
@@ -60,11 +61,11 @@ def _distortion(text: str) -> resample.Distortion:
 
 @dataclass(frozen=True)
 class TiltAndLens:
-    """Settings for resampling projections: tilt and lens distortion.
+    """Settings of the resampling of projections: tilt and lens distortion.
 
     Attributes:
-        tilt: degrees of the axis in the detector's plane; the axis's column grows by tan(tilt) per row. "auto": it
-            is searched for. None: it is unknown, and projections are used as they are.
+        tilt: tilt of the axis in the plane of the detector, in degrees; the column of the axis grows by tan(tilt) per
+            row. "auto": the tilt is measured. None: the tilt is unknown, and projections are used unchanged.
         distortion: distortion of the lens; None: no correction.
     """
 
@@ -96,7 +97,7 @@ class TiltAndLens:
 
     @property
     def tilt_deg(self) -> float:
-        """The roll of the projections in degrees, as far as it is known."""
+        """The known roll of the projections in degrees."""
         return self.tilt if isinstance(self.tilt, float | int) else 0.0
 
     @property
@@ -127,14 +128,14 @@ class TiltAndLens:
         return ViewFilter(apply, resampling.reach, "--tilt and --distortion mix"), self.done(turned)
 
     def done(self, sentence: str) -> StepDone:
-        """What the step did; also recorded if nothing was requested."""
+        """What the step did. It is also recorded if nothing was requested."""
         parameters: dict[str, Any] = {"tilt_deg": self.tilt_deg, **({"tilt": sentence} if sentence else {})}
         for name, value in ({} if self.distortion is None else asdict(self.distortion)).items():
             parameters[f"distortion_{name}"] = value if isinstance(value, float) else str(value)
         return StepDone(sentence, parameters)
 
     def of(self, scan: SelectedScan) -> resample.Resampling | None:
-        """The resampling of the projections; None if they are used as recorded.
+        """The resampling of the projections; None if the projections are used as they were recorded.
 
         Raises:
             ConfigError: --tilt was given for a cone beam.
@@ -155,8 +156,8 @@ class TiltAndLens:
 def with_tilt(
     scan: SelectedScan, frames: NDArray[np.int64], warn: Warn, progress: BandsDone
 ) -> tuple[SelectedScan, dict[str, StepDone]]:
-    """The scan with the tilt found from all detector rows, if that was asked for; and what was done, by the
-    name of the step.
+    """The scan with the tilt that was found from all detector rows, if the user requested it. Also what was done, by
+    the name of the step.
 
     Args:
         frames: projections that may be used.
@@ -200,7 +201,7 @@ def with_tilt(
 
 
 def _search_memory(scan: SelectedScan) -> int:
-    """Bytes that `with_tilt` needs at most, if it searches for the tilt."""
+    """Largest memory in bytes that `with_tilt` needs if it measures the tilt."""
     from beamline.projections.correction import at_once_memory
     from recon.prep.tilt import STEEPEST
 
@@ -214,8 +215,8 @@ def _search_memory(scan: SelectedScan) -> int:
 
 
 def _refined(scan: SelectedScan, frames: NDArray[np.int64], progress: BandsDone) -> tuple[float, float]:
-    """The tilt, measured in projections that were corrected by the tilt of the last round, and its uncertainty;
-    radians.
+    """The tilt and its uncertainty in radians, measured in projections that were corrected by the tilt of the last
+    round.
 
     Raises:
         ValueError: see `find_tilt`.
@@ -236,7 +237,7 @@ def _refined(scan: SelectedScan, frames: NDArray[np.int64], progress: BandsDone)
 
 
 def _without_blur(scan: SelectedScan) -> SelectedScan:
-    """The scan without other filters of the projections, because each mixes neighbouring pixels."""
+    """The scan without other filters of the projections, because each filter mixes neighbouring pixels."""
     selection = scan.selection
     sharp = tuple(step for step in selection.steps if isinstance(step, TiltAndLens) or not isinstance(step, ViewStep))
     logarithms = replace(selection.step(Preparation), noise="log", gain=None)
@@ -244,5 +245,5 @@ def _without_blur(scan: SelectedScan) -> SelectedScan:
 
 
 def _from(offset: int, total: int, progress: BandsDone) -> BandsDone:
-    """Progress of a part of the work that begins at `offset`."""
+    """Report the progress of a part of the work that begins at `offset`."""
     return lambda n, _: progress(offset + n, total)

@@ -23,19 +23,21 @@ if TYPE_CHECKING:
     from beamline.storage.recon_record import Value
     from recon.base.geometry import Geometry
 
-_MOST_PX, _MOST_DEG = 20.0, 30.0  # with larger values a projection shows no detail
-_LEAST_PX = 1.0  # at the edge of the field of view; `auto` models a motion from this size on
+_MOST_PX, _MOST_DEG = 20.0, 30.0  # largest values; beyond these a projection shows no detail
+_LEAST_PX = 1.0  # px at the edge of the field of view; `auto` models a motion of at least this size
 
 
 class _Motion(NamedTuple):
-    """Radians of stage rotation: during an exposure, and from one detector row to the next; signed."""
+    """Rotation of the stage in radians during an exposure, and from the readout of one detector row to the next. Both
+    have a sign.
+    """
 
     arc: float
     skew: float
 
 
 def _spread(text: str) -> str:
-    """none, pixel, or a blur in pixels. ValueError for anything else."""
+    """Parse the option: none, pixel, or a blur in pixels. Raises ValueError for anything else."""
     if text not in ("none", "pixel"):
         try:
             blur = float(text)
@@ -49,8 +51,8 @@ def _spread(text: str) -> str:
 
 
 def _arc(text: str) -> str:
-    """auto, none, or degrees of rotation during the exposure and from the readout of the first row to that of the
-    last. ValueError for others.
+    """Parse the option: auto, none, or the degrees of rotation during the exposure, and from the readout of the first
+    row to that of the last row. Raises ValueError for anything else.
     """
     if text not in ("auto", "none"):
         try:
@@ -69,10 +71,11 @@ class Width:
     """Widths of the rays: the arc of an exposure, and the pixel.
 
     Attributes:
-        spread: "none": thin rays. "pixel": a pixel's own area. A number: that area, and a Gaussian blur of this many
-            pixels.
-        arc: "auto": the motion that the file states, if it is a pixel or more. "none": the stage stood still.
-            "ARC[:READOUT]": degrees of rotation during an exposure, and from the first detector row to the last.
+        spread: "none": thin rays. "pixel": the area of the pixel. A number: the area of the pixel, and a Gaussian blur
+            of this many pixels.
+        arc: "auto": the motion that the file states, if it is a pixel or more. "none": the stage stood still during
+            exposures. "ARC[:READOUT]": degrees of rotation during an exposure, and from the first detector row to the
+            last.
     """
 
     name: ClassVar[str] = "width"
@@ -105,11 +108,11 @@ class Width:
         return StepMemory()
 
     def rays(self, scan: SelectedScan, geometry: Geometry) -> tuple[Geometry, StepDone]:
-        """The geometry with the width of the rays; angles become those of the middle of the exposure.
+        """The geometry with the width of the rays. The angles become the angles in the middle of the exposure.
 
         Raises:
-            ConfigError: a readout arc in a cone beam, or for projections that are or may be rolled or tilted, because
-                each detector row then has different angles.
+            ConfigError: a readout arc was given for a cone beam, or for projections that are or may be rolled or
+                tilted. With a readout arc each detector row has other angles, which such geometries cannot represent.
         """
         from recon.base.ray_width import RayWidth
 
@@ -118,7 +121,7 @@ class Width:
         width = RayWidth(0.0 if self.spread == "none" else 1.0, blur).binned(selection.binning)
         stated, motion = self._motion(source), _Motion(0.0, 0.0)
         if (table := stated_poses(scan)) is not None and table.vectors is not None:
-            stated = None  # vectors already are those of the middle of an exposure
+            stated = None  # the angles of vectors are already those of the middle of the exposure
             if self.arc not in ("auto", "none"):
                 raise ConfigError(
                     f"Omit --exposure-arc {self.arc}, because the projections are given by the vectors of "
@@ -139,7 +142,8 @@ class Width:
                     )
             elif abs(stated.arc) * reach >= _LEAST_PX:
                 motion = _Motion(stated.arc, 0.0 if bent else stated.skew)
-            elif stated.arc:  # too short to be modelled, but the angles are still those of the middle of the exposure
+            # the arc is too short to be modelled, but the angles are still those of the middle of the exposure
+            elif stated.arc:
                 geometry = replace(geometry, angles=geometry.angles + stated.arc / 2)
                 parameters["middle_of_exposure_deg"] = math.degrees(stated.arc / 2)
         if not (width or any(motion)):
@@ -161,7 +165,7 @@ class Width:
         return seen, StepDone(f"Ray width in the reconstruction: {', '.join(statements)}.", parameters)
 
     def _motion(self, source: ScanSource) -> _Motion | None:
-        """The motion asked for, or stated by the file; None: the stage stood still, or the file does not state it."""
+        """The motion that the user or the file states. None: the stage stood still, or the motion is not stated."""
         if self.arc == "none":
             return None
         if self.arc != "auto":
@@ -172,9 +176,9 @@ class Width:
 
 
 def stated_motion(source: ScanSource) -> _Motion | None:
-    """The motion stated by the file of a fly scan; None if the stage stood still or the file states nothing.
+    """The motion in the file of a fly scan. None if the stage stood still, or if the file does not state it.
 
-    The speed is that of the median step between projections, so that passes and missing projections do not matter.
+    The speed follows from the median step between projections, so passes and missing projections do not matter.
     """
     import numpy as np
 

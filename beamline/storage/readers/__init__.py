@@ -1,1 +1,1 @@
-"""Readers: scan files of any format, behind one interface (Protocol)."""
+"""Readers: one interface for scan files of all formats."""

@@ -21,10 +21,12 @@ from beamline.storage.readers.stacks import arrays_of, dataset_at, datasets_text
 from beamline.storage.readers.tiff import OTHER_FILES
 
 Angles = Path | str | ArrayLike
-"""A file, or FILE::NAME of a column or a dataset, in degrees unless it states a unit; or an array in radians."""
-_ANGLE = re.compile(r"angle|theta|rotation|omega|phi|degree|\bdeg\b|°", re.IGNORECASE)  # in the name of a column
-_UNIT = re.compile(r"[\[(]([^\])]+)[\])]$|[ _](deg|degrees?|m?rad|radians?)$", re.IGNORECASE)  # at its end
-_VALUE = re.compile(r"[-+]?(\.?\d|nan\b|inf\b)", re.IGNORECASE)  # what no name of a column begins with
+"""Where angles come from: a file, or FILE::NAME for a column or a dataset, in degrees unless the file states a unit. Or
+an array in radians.
+"""
+_ANGLE = re.compile(r"angle|theta|rotation|omega|phi|degree|\bdeg\b|°", re.IGNORECASE)  # a word for angles
+_UNIT = re.compile(r"[\[(]([^\])]+)[\])]$|[ _](deg|degrees?|m?rad|radians?)$", re.IGNORECASE)  # a unit after a name
+_VALUE = re.compile(r"[-+]?(\.?\d|nan\b|inf\b)", re.IGNORECASE)  # a name does not begin like this
 
 
 def load_angles(angles: Angles, unit: str | None = None) -> NDArray[np.float64]:
@@ -34,7 +36,7 @@ def load_angles(angles: Angles, unit: str | None = None) -> NDArray[np.float64]:
         unit: "deg" or "rad", whatever the file states; None: the unit that it states.
 
     Raises:
-        DataError: they cannot be read, or several lists could be meant.
+        DataError: the angles cannot be read, or it is unclear which of several lists is meant.
     """
     if not isinstance(angles, Path | str):
         return np.atleast_1d(np.asarray(angles, np.float64))
@@ -53,7 +55,7 @@ def angles_at(path: Path, where: str, unit: str | None, default: str = "") -> ND
     """Angles in radians of the array `where` of an HDF5 file, a Zarr or an .npy: a list or a column.
 
     Args:
-        where: "": the only list with a unit of angles, or the only array.
+        where: "": the only list whose unit is one of angles, or the only array.
         unit: "deg" or "rad", whatever the file states; None: the unit that it states, or `default` if it states none.
 
     Raises:
@@ -84,10 +86,11 @@ def _only_angles(file: h5py.File) -> str:
 
 
 def parse_angles(content: str, name: str, column: str = "", unit: str | None = None) -> NDArray[np.float64]:
-    """Radians from text in degrees (see `plan.from_text`), or from a column of a table, as `load_angles` has it.
+    """Angles in radians from text in degrees (see `plan.from_text`), or from a column of a table as described in
+    `load_angles`.
 
     Args:
-        name: where the text came from.
+        name: origin of the text, for messages.
     """
     try:
         text, stated = _column(content.splitlines(), column)
@@ -102,11 +105,11 @@ def parse_angles(content: str, name: str, column: str = "", unit: str | None = N
 
 
 def _column(lines: list[str], wanted: str) -> tuple[str, str]:
-    """The text of one column of a table, a line for each of the table, and its unit.
+    """The text of one column of a table, with one line for each row, and the unit of the column.
 
     Args:
-        wanted: its name, or its number from 0 on; "": the only one that is named after angles. Names stand in the first
-            line, which may be a comment. A text without them is one list, in degrees.
+        wanted: name of the column, or its number counted from 0. "": the only column whose name means angles. Names are
+            in the first line, which may be a comment. A text without names is a single list, in degrees.
     """
     filled = [number for number, line in enumerate(lines) if line.strip()] or [0]
     head, last = (lines[filled[end]].strip() if lines else "" for end in (0, -1))
@@ -129,7 +132,7 @@ def _column(lines: list[str], wanted: str) -> tuple[str, str]:
 
 
 def select_rows(angles: NDArray[np.float64], rows: str) -> NDArray[np.float64]:
-    """Select rows "a:b" of the angles, counted from 0, b excluded; either may be left out."""
+    """Select the rows "a:b" of the angles, counted from 0. Row b is not included; a or b may be left out."""
     match = re.fullmatch(r"(\d*):(\d*)", rows.strip())
     if match is None:
         raise DataError(
@@ -148,14 +151,14 @@ def assign(
 ) -> NDArray[np.float64]:
     """Assign an angle in radians to each frame of a source, NaN if unknown.
 
-    There may be one angle for each projection; or one for each number of a series of files of which some are missing;
-    or one for each frame, if the order of all frames is known. A log with nan for each dark and flat also tells that
-    order. A log whose steps are equal from end to end contains no rows of darks and flats, because the stage stands
-    still for these.
+    Three cases fit. (1) There is one angle for each projection. (2) There is one angle for each number of a series of
+    files, of which some are missing. (3) There is one angle for each frame, and the order of all frames is known; a log
+    with nan for each dark and flat also states this order. A log with equal steps from end to end contains no rows of
+    darks and flats, because the stage stands still while these are taken.
 
     Args:
         name: where the angles come from, for messages.
-        of_views: the angles are those of projections alone.
+        of_views: True if the angles are those of the projections only.
 
     Raises:
         DataError: the angles fit none of these cases. The message names the rows that are certainly those of the
@@ -181,12 +184,12 @@ def assign(
 
 
 def _count_all(numbers: NDArray[np.int64], n: int) -> bool:
-    """True if the numbers of files, no two of them the same, go from the first to the last of n."""
+    """True if the numbers of the files are all different, and include the first and the last of n numbers."""
     return bool(numbers.min() >= 0 and np.ptp(numbers) + 1 == n and np.unique(numbers).size == numbers.size)
 
 
 def _in_equal_steps(angles: NDArray[np.float64]) -> bool:
-    """True if no step is half as long again, or half as short, as the typical one."""
+    """True if every step has between half and one and a half times the typical length."""
     steps = np.diff(angles)
     typical = float(np.median(steps))
     return bool((np.abs(steps - typical) < abs(typical) / 2).all())

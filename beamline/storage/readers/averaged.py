@@ -16,9 +16,9 @@ from beamline.storage.readers.frames import Frames, Read
 from drivers.base.frame import FrameKind
 
 JOINED_DEG = "frames_per_view_joined_deg"
-"""Attribute of a scan whose frames are averaged: the largest angle between two frames of a view."""
+"""Attribute of a scan whose frames are averaged: the largest angle between two frames of one projection."""
 _MEASURED = ("angles", "times", "aside", "shifts", "energies", "currents")
-_EXACT = 2  # bytes of a whole number, whose sums over a projection uint32 holds
+_EXACT = 2  # bytes of an integer for which the sum over a projection fits into uint32
 
 
 class AveragedSource(Frames):
@@ -29,9 +29,9 @@ class AveragedSource(Frames):
     Therefore a projection with missing frames never takes frames of its neighbour. In a growing file a projection is
     complete as soon as a frame of the next one, or its n-th frame, exists.
 
-    The mean is that of the frames without an alarm, or of all if each has one. Integers are summed as such, real
-    numbers in float64; the mean is rounded once, to float32 (a part in 10^7). Frames that are damaged or cannot be read
-    are left out.
+    Frames with an alarm are left out of the mean, unless all frames of the projection have one. Damaged and unreadable
+    frames are also left out. Integers are summed as integers, real numbers in float64. The mean is rounded once, to
+    float32 (a part in 10^7).
     """
 
     def __init__(self, base: ScanSource, n: int) -> None:
@@ -66,7 +66,7 @@ class AveragedSource(Frames):
         super()._update()
 
     def _joined(self, known: FrameTable) -> FrameTable:
-        """The first frame of each projection, with the means of what is measured."""
+        """The table with the first frame of each projection, and with the means of the measured values."""
 
         def means(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
             if values is None:
@@ -80,13 +80,15 @@ class AveragedSource(Frames):
             kinds=known.kinds[[rows[0] for rows in self._usable]],
             flags=None if known.flags is None else known.flags.of_groups(self._used),
             altered=np.zeros(len(table), np.bool_),
-            replaces=None,  # such frames are gone
+            replaces=None,  # the frames that these refer to no longer exist
             numbers=None,
             **measured,
         )
 
     def _apart(self) -> float:
-        """Radians from a projection's first frame, beyond which a frame belongs to another projection."""
+        """Angle in radians from the first frame of a projection, beyond which a frame belongs to the next
+        projection.
+        """
         table = self._base.table
         planned = np.radians(np.asarray(self._base.plan.get("angles_deg", ()), np.float64))
         angles = planned if planned.size > self._n else table.angles[table.views]
@@ -95,7 +97,9 @@ class AveragedSource(Frames):
         return float(np.median(steps)) * (1 - 0.5 / self._n) if steps.size else np.inf
 
     def _since(self, apart: float, first: int) -> list[list[int]]:
-        """The rows of base from `first` on, by projection; without those of a projection that may still get frames."""
+        """The rows of `base` from `first` on, grouped by projection. A projection that may still get frames is left
+        out.
+        """
         keys, angles, groups = self._base.table.kinds, self._base.table.angles, list[list[int]]()
         view, may_grow = list[int](), False
         for row in (first + np.flatnonzero(keys[first:] != FrameKind.INVALID)).tolist():
@@ -124,7 +128,7 @@ class AveragedSource(Frames):
             images = read_known(base, [wanted[i][turn] for i in views], rows)
             bad = base.damaged | base.unreadable.keys()
             for i, image in zip(views, images, strict=True):
-                if wanted[i][turn] not in bad or bad.issuperset(wanted[i]):  # the last one where all are
+                if wanted[i][turn] not in bad or bad.issuperset(wanted[i]):  # the last frame, if all have an alarm
                     np.add(total[i], image, out=total[i], casting="unsafe")
                     counted[i] += 1
         for group in wanted:
@@ -134,6 +138,6 @@ class AveragedSource(Frames):
 
 
 def stated_frames_per_view(source: ScanSource) -> int:
-    """Frames per projection by the plan in the file; 1 if it has no plan."""
+    """Frames per projection according to the plan in the file; 1 if the file has no plan."""
     stated = source.plan.get("frames_per_view", 1)
     return stated if isinstance(stated, int) and stated > 1 else 1

@@ -24,15 +24,15 @@ from recon.base.arrays import Mask
 
 Quantity = Literal["counts", "line_integrals", "unknown"]
 Stated = Quantity | Literal["transmission"]
-"""Of a file or a caller; transmission is read as counts of a beam of 1 without darks."""
+"""A quantity that a file or a caller states. Transmission is read as counts with flats of 1 and darks of 0."""
 Attributes = Mapping[str, str | float | int]
 
 WHOLE = slice(None)
 
 
 class NotUsed(NamedTuple):
-    """A field of a file that is ignored: its path, its value, the reason or what to do, whether it may matter, and
-    whether a volume without it is wrong by more than a hundredth.
+    """A field of a file that is not used: its path, its value, the reason or what to do. Also whether the value may
+    matter, and whether ignoring it makes the volume wrong by more than 1 %.
     """
 
     where: str
@@ -43,40 +43,41 @@ class NotUsed(NamedTuple):
 
 
 class ScanSource(ABC):
-    """The frames of one scan and their metadata. Nothing is guessed: unknown values are None, NaN or "unknown".
+    """The frames of one scan and their metadata. No value is guessed: unknown values are None, NaN or "unknown".
 
-    A format's subclass has `read` and `close`. It sets `path`, `shape`, `dtype`, `table` and `facts` where it opens the
-    file, and those of the other fields that its format states.
+    The subclass of a format defines `read` and `close`. When it opens the file, it sets `path`, `shape`, `dtype`,
+    `table`, `facts`, and the other fields that the format states.
 
     Attributes:
-        path: of the opened scan.
+        path: path of the opened scan.
         format: "nxtomo", "diamond_nexus", "data_exchange", "tiff_series", "tiff_stack", ...
         shape: (rows, cols) of a frame.
-        dtype: of the pixels that read() returns.
-        quantity: of the pixels. "unknown" if neither the file nor the caller states it.
+        dtype: type of the pixels that read() returns.
+        quantity: quantity of the pixels; "unknown" if neither the file nor the caller states it.
         table: the table of the frames; `refresh` replaces it.
-        facts: `attributes` of a format in which they do not change.
+        facts: the values of `attributes`, for a format in which they do not change.
         pixel_size_mm: pixel size at the sample; for a cone beam, on the detector.
-        axis_col: rotation axis in 0-based pixel-centre columns.
-        cols: (first, end) columns of the detector that a frame has; None: all.
+        axis_col: column of the rotation axis, counted from 0 at the centre of the first column.
+        cols: (first, end) detector columns that a frame contains; None: all.
         cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
         central_ray: (row, column) at which the central ray meets the detector according to the file; it is shown but
             not used; NaN: not stated.
         unreadable: rows that `read_known` could not read from the file, each with the reason.
-        row_pitch_mm: height of a pixel, as `pixel_size_mm`, if it differs from the width; None: pixels are square.
-        in_order: the frames are in the order of acquisition. False: darks and flats stand before the projections,
-            whenever they were taken.
+        row_pitch_mm: height of a pixel, measured like `pixel_size_mm`, if it differs from the width; None: pixels are
+            square.
+        in_order: the frames are in the order of acquisition. False: darks and flats come first in the table, whenever
+            they were taken.
         untyped: True if the file does not state whether pixels are integers or real numbers.
         pixel_mask: bool [row, col], pixels that must not be used according to the file; None if the file has no mask.
         frames_per_view: number of camera frames that are averaged to one projection.
-        not_used: fields on geometry, units, order and validity that the file states but that are not used.
-        unpack_bytes: bytes of memory that are taken while a frame's part of a compressed file is unpacked.
+        not_used: fields of the file about geometry, units, order or validity that are not used.
+        unpack_bytes: bytes of memory that are needed while the data of a frame are decompressed.
         plan: the requested scan, as this program's files record it; empty if unknown.
-        row_period: s from the exposure of a row to that of the next; 0: all together, None: unknown.
-        decisions: what was chosen after passes, oldest first: values of the event `next_chosen`.
-        stated_ending: `ending` of a format in which it does not change.
-        angles_unit: the unit of a list of angles in the file that states none; "": such a list is an error.
-        side_files: True if a settings file of the scanner's maker may lie next to it.
+        row_period: s between the exposures of two neighbouring rows; 0: all rows are exposed together; None: unknown.
+        decisions: the choices after passes, oldest first, as values of the event `next_chosen`.
+        stated_ending: the value of `ending`, for a format in which it does not change.
+        angles_unit: unit that is assumed if a list of angles in the file states no unit; "": such a list is an error.
+        side_files: True if a settings file of the manufacturer may lie next to the scan.
     """
 
     path: Path
@@ -113,8 +114,19 @@ class ScanSource(ABC):
         return None
 
     @property
+    def stack_options(self) -> tuple[str, str]:
+        """Path of the dataset of the projections, and the options that name the other datasets; "" for formats whose
+        datasets cannot be chosen by options."""
+        return str(self.attributes.get("data", "")), ""
+
+    def exchange_sinogram(self, *, views_first: bool) -> str:
+        """What the user can do to exchange the two dimensions of a sinogram, of which the first is now that of the
+        projections or of the columns."""
+        return f"give --order {'col,view' if views_first else 'view,col'}"
+
+    @property
     def frame_bytes(self) -> int:
-        """Bytes that are decompressed to read a frame, or any row of it."""
+        """Number of bytes that are decompressed to read a frame, or any row of a frame."""
         return self.shape[0] * self.shape[1] * self.dtype.itemsize
 
     @property
@@ -124,12 +136,12 @@ class ScanSource(ABC):
 
     @property
     def ending(self) -> ScanEnding:
-        """How the scan ended, as far as the file states; a copy states the same."""
+        """How the scan ended, as far as the file states it. A copy of the file states the same."""
         return self.stated_ending
 
     @property
     def attributes(self) -> Attributes:
-        """Further metadata of the file, for the record."""
+        """Further metadata of the file, to show and to store."""
         return self.facts
 
     @property
@@ -160,7 +172,7 @@ class ScanSource(ABC):
         return len(self.table)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """The frames from `first` on, each with all that is known of it; pixels are of the file's type."""
+        """Yields the frames from `first` on with all known values. Pixels have the type that the file has."""
         for row in range(first, len(table := self.table)):
             counts = read_known(self, [row])[0]
             yield table.frame(row, counts, FrameKind.INVALID if row in self.unreadable else None)
@@ -173,7 +185,9 @@ class ScanSource(ABC):
 
 
 def frame_indices(frames: slice | ArrayLike, n: int) -> NDArray[np.int64]:
-    """Row numbers of a slice or an array (negative ones count from the end); IndexError beyond the n readable."""
+    """The row numbers of a slice or an array. Negative numbers count from the end. Raises IndexError for rows beyond
+    the n readable ones.
+    """
     if isinstance(frames, slice):
         return np.arange(n)[frames]
     indices = np.atleast_1d(np.asarray(frames))
@@ -188,9 +202,9 @@ def frame_indices(frames: slice | ArrayLike, n: int) -> NDArray[np.int64]:
 
 
 def read_known(source: ScanSource, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-    """`source.read`, with NaN (0 for integers) for unreadable frames, see `unreadable`.
+    """Like `source.read`, but the pixels of an unreadable frame become NaN (0 for integers), see `unreadable`.
 
-    Real numbers beyond LARGEST, which no detector counts and which float32 may not represent, also become NaN.
+    Real numbers beyond LARGEST also become NaN: no detector counts so many, and float32 may not represent them.
     """
     try:
         return measured(source.read(frames) if rows == WHOLE else source.read(frames, rows))
@@ -211,7 +225,7 @@ def measured(pixels: NDArray[Any]) -> NDArray[Any]:
     """Pixels [frame, row, col] with NaN for real numbers beyond LARGEST."""
     if pixels.dtype.kind != "f":
         return pixels
-    most = min(LARGEST, float(np.finfo(pixels.dtype).max))  # float16 does not hold LARGEST
+    most = min(LARGEST, float(np.finfo(pixels.dtype).max))  # float16 cannot represent LARGEST
     for number, image in enumerate(pixels):
         if (beyond := np.abs(image) > most).any():
             if not pixels.flags.writeable:
@@ -221,7 +235,7 @@ def measured(pixels: NDArray[Any]) -> NDArray[Any]:
 
 
 class TakesTooLongError(DataError):
-    """The check was ended because it would take too long; the findings so far are valid."""
+    """A check ended early because it would take too long. Its findings so far are valid."""
 
 
 @dataclass(frozen=True)
@@ -230,10 +244,11 @@ class Opening:
 
     Attributes:
         follow: the file may still be growing.
-        own_angles: the file's angles are used; False: the caller supplies the angles, so the file need not have any.
-        one_series: the caller states the kind of each frame; names of files are not used for that.
-        counts: the caller states that pixels are counts, and gives no darks and flats: they may lie next to the
-            projections.
+        own_angles: True: the angles in the file are used. False: the caller supplies the angles, so the file need not
+            have any.
+        one_series: True if the caller states the kind of each frame, so that file names are not used for it.
+        counts: True if the caller states that pixels are counts, but gives no darks and flats. The darks and flats may
+            then lie next to the projections.
     """
 
     follow: bool = False
@@ -244,11 +259,11 @@ class Opening:
 
 @dataclass(frozen=True)
 class NamedArrays:
-    """The paths of arrays in a file that the caller names as a scan; None for those that are not named.
+    """The paths of the arrays in a file that the caller names as a scan; None for arrays that are not named.
 
     Attributes:
-        data: of the projections; the order of the dimensions may follow, as in "/images:view,col,row".
-        angles: of the angles of the projections alone.
+        data: path of the projections; the order of the dimensions may follow, as in "/images:view,col,row".
+        angles: path of the angles of the projections (not of darks and flats).
         own_angles: as in `Opening`.
     """
 
@@ -269,12 +284,15 @@ class ScanFormat:
     """A file format in the registry `storage.readers.formats.FORMATS`.
 
     Attributes:
-        name: for messages.
-        recognises: whether a path holds this format. It is asked in the registry's order, and it may raise DataError
-            (NotReadyError while following) for a file of its kind that cannot be read.
-        open: the reader of a path that is recognised.
-        at: the scan to which these arrays of a file belong; None if they are no scan of this format.
-        references: the scan in an open HDF5 file with frames of a kind (dark or flat); None if it has none.
+        name: name of the format for messages.
+        recognises: function that returns whether the file at a path has this format. Formats are asked in the order of
+            the registry. The function may raise DataError for a file of this format that cannot be read, or
+            NotReadyError while following it.
+        open: function that opens a path that is recognised.
+        at: function that returns the scan to which these arrays of a file belong; None if they are not a scan of this
+            format.
+        references: function that returns the scan in an open HDF5 file that has frames of one kind (dark or flat); None
+            if the file has no such scan.
     """
 
     name: str

@@ -39,8 +39,9 @@ from drivers.base.frame import FrameKind
 _UNKNOWN = "the names are unknown; theta:y:x is assumed"
 _DETECTOR = "measurement/instrument/detector"
 _FLATS = "process/acquisition/flat_fields"
-_ANY = {"": 1.0, "x": 1.0, "1": 1.0, "dimensionless": 1.0, "pixel": 1.0}  # of a number without a unit
-_ENERGIES, _SIZES = (0.01, 1e4), (1e-6, 1.0)  # keV and mm of a detector, of numbers without a unit
+_ANY = {"": 1.0, "x": 1.0, "1": 1.0, "dimensionless": 1.0, "pixel": 1.0}  # units of numbers without a unit
+# plausible ranges of keV, and of mm of a detector, for numbers without a unit
+_ENERGIES, _SIZES = (0.01, 1e4), (1e-6, 1.0)
 _THETAS = {FrameKind.DARK: "exchange/theta_dark", FrameKind.FLAT: "exchange/theta_white"}
 TEXTS = {"title": "exchange/title", "sample": "measurement/sample/name"}
 PLACES = (
@@ -48,6 +49,8 @@ PLACES = (
     (FrameKind.FLAT, "/exchange/data_white"),
     (FrameKind.PROJECTION, "/exchange/data"),
 )
+
+_OTHERS = (("angle", "theta"), ("dark", "data_dark"), ("flat", "data_white"))  # names of options, and datasets
 
 
 def open_exchange(path: Path, *, follow: bool = False, own_angles: bool = True) -> ExchangeSource:
@@ -93,13 +96,21 @@ class ExchangeSource(StacksSource):
     """A scan in a Data Exchange file.
 
     Attributes:
-        own_angles: the angles of the file are used.
-        grows: it was still being written when it was opened. Its frames are numbered as they arrive.
+        own_angles: True if the angles of the file are used.
+        grows: True if the file was still being written when it was opened. Its frames are then numbered in the order in
+            which they arrive.
     """
 
     own_angles: bool = True
     grows: bool = False
     angles_unit = "degrees"
+
+    @property
+    def stack_options(self) -> tuple[str, str]:
+        return "exchange/data", "".join(f" --{name}s-path exchange/{where}" for name, where in _OTHERS)
+
+    def exchange_sinogram(self, *, views_first: bool) -> str:
+        return f"set the attribute axes of /exchange/data to {'x:theta' if views_first else 'theta:x'}"
 
     def refresh(self) -> int:
         if not self.grows:
@@ -119,8 +130,8 @@ class ExchangeSource(StacksSource):
         """Sort darks and flats among the projections, if the file says when flats were taken.
 
         Args:
-            thetas: radians at which the darks and the flats were taken, where the file states them.
-            later: the first of the flats that were taken after the projections; None: the acquisition does not say.
+            thetas: angles in radians at which the darks and the flats were taken, if the file states them.
+            later: index of the first flat that was taken after the projections; None: the file does not state it.
         """
         table, place = self.table, np.full(len(self.table), -1.0)
         views = table.angles[table.views]
@@ -128,10 +139,11 @@ class ExchangeSource(StacksSource):
         steps = np.diff(views)
         in_turn = bool((steps > 0).all() or (steps < 0).all())
         for kind, theta in thetas.items() if in_turn else ():
-            at = np.abs(views - theta[:, None]).argmin(axis=1)
-            place[table.of_kind(kind)] = np.where(at == views.size - 1, views.size, at - 0.5)  # those of the end
+            nearest = np.abs(views - theta[:, None]).argmin(axis=1)
+            # frames taken after the projections
+            place[table.of_kind(kind)] = np.where(nearest == views.size - 1, views.size, nearest - 0.5)
         turned = np.flatnonzero(np.diff(thetas.get(FrameKind.FLAT, np.zeros(1)))) + 1
-        # projections in any order; flats at two places of the stage
+        # the projections may be in any order; flats were taken at two positions of the stage
         if later is None and not in_turn and turned.size == 1:
             later = int(turned[0])
         if later is not None:
@@ -144,14 +156,14 @@ class ExchangeSource(StacksSource):
 
 
 def _thetas(file: h5py.File, stacks: Sequence[FrameStack]) -> dict[FrameKind, NDArray[np.float64]]:
-    """Radians at which the frames of each stack of references were taken, where the file states them."""
+    """Angles in radians at which the frames of each stack of darks or flats were taken, if the file states them."""
     listed = {part.kind: _list(file, _THETAS[part.kind], len(part.frames)) for part in stacks if part.kind in _THETAS}
     return {kind: theta for kind, theta in listed.items() if theta is not None}
 
 
 def _later_flats(file: h5py.File, n: int) -> int | None:
-    """The first of n flats that were taken after the projections, if the acquisition states that it took equally many
-    before and after.
+    """The index of the first of n flats that was taken after the projections. It is known if the file states that
+    equally many flats were taken before and after the projections.
     """
     mode = datasets.dataset(file, f"{_FLATS}/flat_field_mode")
     each = datasets.scalar(file, f"{_FLATS}/num_flat_fields", _ANY) or n // 2
@@ -159,7 +171,9 @@ def _later_flats(file: h5py.File, n: int) -> int | None:
 
 
 def _list(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
-    """Angles [frame] in radians; default unit: that of the projections. None without a list of this length."""
+    """Angles [frame] in radians. If no unit is stated, the unit of the projections' angles is used. None if there is no
+    list of this length.
+    """
     item = datasets.dataset(file, where)
     if item is None or item.size != n or item.dtype.kind not in "uif":
         return None
@@ -170,7 +184,9 @@ def _list(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
 
 
 def _set_exposures(table: FrameTable, file: h5py.File) -> None:
-    """Set exposures: one for all frames or for each projection, and that of the flats if another one is stated."""
+    """Set the exposures: one exposure for all frames or one for each projection. Flats get another exposure if the file
+    states it.
+    """
     seconds = _seconds(file, f"{_DETECTOR}/exposure_time", table.views.size)
     if seconds is None:
         return
@@ -183,14 +199,16 @@ def _set_exposures(table: FrameTable, file: h5py.File) -> None:
 
 
 def _seconds(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
-    """Positive times in s, one or one for each frame; None if the file has none, or in an unknown unit."""
+    """Positive times in s: a single one, or one for each frame. None if the file has no times, or if their unit is
+    unknown.
+    """
     item = datasets.dataset(file, where)
     values = None if item is None or item.size not in (1, n) else datasets.in_units(item, EXCHANGE_TIME_UNITS)
     return values if values is not None and (values > 0).all() else None
 
 
 def _words(item: h5py.Dataset) -> str:
-    """A text, also where an area detector writes its characters as numbers."""
+    """A text. An area detector (EPICS) may have written its characters as numbers."""
     values = np.ravel(datasets.values_of(item))
     return (
         values.astype(np.uint8).tobytes().decode("ascii", "replace").strip("\0 ")
@@ -204,12 +222,14 @@ def _axes(item: h5py.Dataset) -> list[str]:
 
 
 def _order(item: h5py.Dataset) -> Order | None:
-    """Which dimensions are frames, rows and columns, by the attribute `axes`; None if that says nothing."""
+    """Which dimensions are frames, rows and columns according to the attribute `axes`; None if the attribute does not
+    tell.
+    """
     return order_of_axes(_axes(item))
 
 
 def _set_scale(source: ExchangeSource, file: h5py.File) -> None:
-    """Pixel size and energy; what the file says of them in a unit that cannot be joins `not_used`."""
+    """Read pixel size and energy. A value in an impossible unit is added to `not_used`."""
     pixel = file.attrs.get("pixel_size_mm")
     source.pixel_size_mm = float(pixel) if isinstance(pixel, int | float) and np.isfinite(pixel) else None
     energy = "measurement/instrument/monochromator/energy"
@@ -227,8 +247,8 @@ def _set_scale(source: ExchangeSource, file: h5py.File) -> None:
 def _measured(
     source: ExchangeSource, file: h5py.File, where: str, units: Mapping[str, float], range: tuple[float, float]
 ) -> float | None:
-    """A positive number. Without a unit it is assumed to be SI, as the format says, if the value is then in a plausible
-    range.
+    """A positive number. If it has no unit, an SI unit is assumed, as the format prescribes, provided that the value is
+    then in a plausible range.
     """
     value, item = _positive(file, where, units), datasets.dataset(file, where)
     if value is None or item is None or datasets.attribute(item, "units") or range[0] <= value <= range[1]:
@@ -270,15 +290,15 @@ def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.
 
 
 def _of_rotation(file: h5py.File, what: str) -> float | None:
-    """The one number, in radians, that the acquisition or attributes of the exchange data state for the rotation, in
-    degrees unless it has a unit; None: several or none.
+    """A single number about the rotation, converted to radians, from the acquisition group or from attributes of the
+    exchange data. It is in degrees unless a unit is stated. None if no number, or several, are stated.
     """
     attributes = [item.attrs.get(f"rotation_{what}") for item in (file["exchange"], file["exchange/data"])]
     by_group = datasets.scalar(
         file, f"process/acquisition/rotation/{what}", {**datasets.ANGLE_UNITS, "": math.radians(1)}
     )
-    found = {by_group, *(math.radians(value) for value in attributes if isinstance(value, np.number))} - {None}
-    return found.pop() if len(found) == 1 else None
+    numbers = {by_group, *(math.radians(value) for value in attributes if isinstance(value, np.number))} - {None}
+    return numbers.pop() if len(numbers) == 1 else None
 
 
 def _attributes(file: h5py.File) -> dict[str, str | float | int]:
@@ -302,7 +322,7 @@ def _recognises(path: Path, opening: Opening) -> bool:
         return datasets.dataset(file, "exchange/data") is not None or bool(datasets.broken_link(file, "exchange/data"))
 
 
-def _at(path: Path, arrays: NamedArrays) -> ExchangeSource | None:
+def _scan_of_arrays(path: Path, arrays: NamedArrays) -> ExchangeSource | None:
     own = arrays.alone and arrays.data.strip("/") == "exchange/data" and _recognises(path, Opening())
     return open_exchange(path, own_angles=arrays.own_angles) if own else None
 
@@ -316,6 +336,6 @@ FORMAT = ScanFormat(
     "/exchange/data (Data Exchange)",
     _recognises,
     lambda path, opening: open_exchange(path, follow=opening.follow, own_angles=opening.own_angles),
-    _at,
+    _scan_of_arrays,
     _references,
 )

@@ -1,4 +1,5 @@
-"""Fields in files of other programs that affect geometry, units, frame order or validity, and how each is used.
+"""Lists the fields in files of other programs that affect geometry, units, frame order or validity, and how each field
+is used.
 
 `NXTOMO` and `EXCHANGE` are the lists behind docs/scan_files.md. A reader calls `stated_in` to find the fields that a
 file states but no reader uses. `info` shows these fields, and `validate` warns if such a value may change the volume.
@@ -21,10 +22,11 @@ from beamline.storage.readers.base import NotUsed, ScanSource
 Matters = Callable[[NDArray[Any], h5py.Dataset, ScanSource], bool]
 """Whether a value [...] of a dataset may change the volume of a scan that is read without it."""
 
-EXCHANGE_LENGTH_UNITS = {**datasets.LENGTH_UNITS, "": 1e3}  # metre without a unit, as the format says
+EXCHANGE_LENGTH_UNITS = {**datasets.LENGTH_UNITS, "": 1e3}  # the format prescribes metres if no unit is stated
 EXCHANGE_ENERGY_UNITS = {**datasets.ENERGY_UNITS, "": datasets.ENERGY_UNITS["j"]}
-EXCHANGE_TIME_UNITS = {**datasets.TIME_UNITS, "": 1.0}  # seconds without a unit, as the format says
-_HALF_PIXEL, _WRONG = 0.5, 0.01  # what moves by less is not seen; a share of lengths from which a volume is wrong
+EXCHANGE_TIME_UNITS = {**datasets.TIME_UNITS, "": 1.0}  # the format prescribes seconds if no unit is stated
+# px, below which a displacement is not visible; relative error of a length, above which the volume is wrong
+_HALF_PIXEL, _WRONG = 0.5, 0.01
 
 
 @dataclass(frozen=True)
@@ -32,12 +34,14 @@ class Entry:
     """A field of a file format.
 
     Attributes:
-        where: its path below the entry, or below the root of Data Exchange; "detector/" is the detector that is read.
-        use: how this program uses the field, or, if `used` is False, why its value changes nothing or what the user can
+        where: path of the field below the entry, or below the root of a Data Exchange file; "detector/" stands for the
+            detector that is read.
+        use: how this program uses the field. If `used` is False: why its value changes nothing, or what the user can
             do.
-        used: it is read.
+        used: True if this program reads the field.
         units: the known units of a number that is used.
-        matters: for a field that is not used, whether its value may change the volume; None: it cannot.
+        matters: for a field that is not used: function that returns whether its value may change the volume. None: no
+            value can.
     """
 
     where: str
@@ -48,9 +52,9 @@ class Entry:
 
 
 def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[NotUsed, ...]:
-    """The fields stated in a file but ignored; a value that may change the volume is a doubt.
+    """The fields that a file states and that are not used. A value that may change the volume is marked as a doubt.
 
-    A number whose unit is unknown is also ignored, and therefore listed.
+    A number whose unit is unknown cannot be used, so it is listed, too.
     """
     frames, views = len(source.table), source.table.views
     unused = list[NotUsed]()
@@ -58,7 +62,8 @@ def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
         item = _dataset(root, field.where, detector) if field.units is not None or not field.used else None
         if item is None or item.size == 0:
             continue
-        if item.size * item.dtype.itemsize > datasets.BRIEF:  # no place, time or number of each frame
+        # excludes positions, times and numbers that belong to each frame
+        if item.size * item.dtype.itemsize > datasets.BRIEF:
             unused.append(NotUsed(field.where, f"{' x '.join(map(str, item.shape))} values", "it is too large", False))
             continue
         value, why, doubt, share = np.asarray(datasets.values_of(item)), field.use, True, 0.0
@@ -76,7 +81,9 @@ def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
 
 
 def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> str:
-    """Why a stated number cannot be used for its unit; "" if the unit is known, or nothing is stated."""
+    """A text that says that a number cannot be used because its unit is unknown; "" if the unit is known, or no number
+    is stated.
+    """
     stated = datasets.text(value) if value.dtype.kind in "SO" else _true(value, item, source)
     if field.units is None or not stated or datasets.in_units(item, field.units) is not None:
         return ""
@@ -87,8 +94,8 @@ def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source:
 
 
 def _varying(field: Entry, item: h5py.Dataset, source: ScanSource) -> tuple[str, float]:
-    """The effect of taking one length for all projections, where the file states others for some, and their share; ""
-    if it is not visible.
+    """The effect of using one length for all projections although the file states other lengths for some, and the share
+    of these projections. "" if the effect is not visible.
     """
     lengths = None if field.units is None or "mm" not in field.units else datasets.in_units(item, field.units)
     if lengths is None or lengths.size == 1:
@@ -97,7 +104,7 @@ def _varying(field: Entry, item: h5py.Dataset, source: ScanSource) -> tuple[str,
     typical = np.median(lengths)
     whole = typical if "pixel_size" in field.where else np.inf if source.cone is None else source.cone[1]
     share = float(np.max(np.abs(lengths - typical)) / whole)
-    moved = share * max(source.shape) / 2  # px at the edge of the field
+    moved = share * max(source.shape) / 2  # px at the edge of the field of view
     return (_ONE.format(moved), share) if moved > _HALF_PIXEL else ("", 0.0)
 
 
@@ -123,7 +130,9 @@ def _true(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
 
 
 def _moves(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
-    """Places of frames that differ by more than half a pixel between projections, or by anything in an unknown unit."""
+    """True if the positions of frames differ between projections by more than half a pixel; in an unknown unit, by any
+    amount.
+    """
     factor = datasets.factor_of(datasets.attribute(item, "units"), datasets.LENGTH_UNITS)
     if value.dtype.kind not in "uif" or value.size != len(source.table):
         return False
@@ -139,7 +148,9 @@ def _shifts(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool
 
 
 def _disagrees(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
-    """More than 1 % from 1: an optical magnification that nothing in the file's pixel sizes tells apart."""
+    """True if the optical magnification differs from 1 by more than 1 %. It is then unclear whether the pixel sizes in
+    the file include it.
+    """
     return value.dtype.kind in "uif" and value.size == 1 and abs(float(value.reshape(-1)[0]) - 1) > 0.01
 
 

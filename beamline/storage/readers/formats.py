@@ -1,7 +1,7 @@
 """The list of the formats of scans, and the one way to open a file of any of them.
 
-A scan file of this program is not searched for its frames: `own_scan` reads it at fixed paths. The formats below are
-those of other programs, with the checks that their files need.
+`own_scan` reads a scan file of this program at fixed paths, without a search. The formats below are those of other
+programs, with the checks that their files need.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ from beamline.storage.writers.recon_file import opened_reconstruction
 from drivers.base.frame import FrameKind
 from recon.base.registry import Registry, in_folders
 
-REGISTRY = (  # modules in this folder, asked in this order; the first one before those in folders, the others after
+# modules in this folder, asked in this order. The first one is asked before the formats in folders, the others after
+# them.
+REGISTRY = (
     "nxtomo",
     "dxchange",
     "stacks",
@@ -34,25 +36,26 @@ _OURS = {name: f"beamline.storage.readers.{name}" for name in REGISTRY}
 _MODULES = {REGISTRY[0]: _OURS[REGISTRY[0]], **in_folders("beamline.storage.readers", "FORMATS"), **_OURS}
 
 
-def _fitting(name: str, found: Any) -> ScanFormat:
-    if not isinstance(found, ScanFormat):
-        raise ValueError(f"it is a {type(found).__name__}; expected a ScanFormat, see beamline.storage.readers.base")
-    return found
+def _fitting(name: str, entry: Any) -> ScanFormat:
+    if not isinstance(entry, ScanFormat):
+        raise ValueError(f"it is a {type(entry).__name__}; expected a ScanFormat, see beamline.storage.readers.base")
+    return entry
 
 
 FORMATS: tuple[ScanFormat, ...] = tuple(
     Registry("reader", {name: import_module(module).FORMAT for name, module in _MODULES.items()}, _fitting).values()
 )
-"""Every format that is read, those of other packages last; adding one takes its file, and its line in REGISTRY
-or in FORMATS of a folder of formats."""
+"""Every format that can be read; formats of other packages come last. To add a format, write its module and add its
+line to REGISTRY, or to FORMATS of a folder of formats.
+"""
 
 
 def open_file(path: Path, opening: Opening) -> ScanSource:
     """Open the scan of a path.
 
     Raises:
-        DataError: it has no known format, or it cannot be read.
-        NotReadyError: it is just being created (while following).
+        DataError: the path has no known format, or it cannot be read.
+        NotReadyError: the file is just being created (only with `follow`).
     """
     if path.is_file() and not opening.follow:
         refuse_substitute(path)
@@ -68,28 +71,30 @@ def open_file(path: Path, opening: Opening) -> ScanSource:
 
 
 def open_arrays(path: Path, arrays: NamedArrays) -> ScanSource:
-    """Open the scan to which the named arrays of a file belong: as its format has it, or as stacks of images."""
+    """Open the scan to which the named arrays of a file belong: with the reader of its format, or as stacks of
+    images.
+    """
     with hdf5.readable(path):
         if arrays.alone and (own := open_own(path)) is not None:
             if own.holds(arrays.data):
                 return own
             own.close()
-        found = (kind.at(path, arrays) for kind in FORMATS)
-        return next(source for source in found if source is not None)  # `stacks` takes any
+        sources = (kind.at(path, arrays) for kind in FORMATS)
+        return next(source for source in sources if source is not None)  # the reader `stacks` accepts any file
 
 
 def references_in(path: Path, file: h5py.File, kind: FrameKind) -> ScanSource | None:
-    """The scan in an open file that has frames of a kind (dark or flat); None if the file is no such scan."""
+    """The scan in an open file that has frames of one kind (dark or flat); None if the file has no such frames."""
     if layout.COMMITTED in file and (own := open_own(path)) is not None:
         if own.table.has(kind):
             return own
         own.close()
-    found = (each.references(path, file, kind) for each in FORMATS)
-    return next((source for source in found if source is not None), None)
+    sources = (each.references(path, file, kind) for each in FORMATS)
+    return next((source for source in sources if source is not None), None)
 
 
 def scan_format(path: Path) -> str | None:
-    """The name of the format of the scan in an HDF5 file; None if it is no scan."""
+    """The name of the format of the scan in an HDF5 file; None if the file is not a scan."""
     with hdf5.readable(path):
         return next((kind.name for kind in FORMATS if kind.recognises(path, Opening())), None)
 

@@ -1,4 +1,6 @@
-"""Frames: a scan composed of the frames of other scan files, such as its parts, also with changed pixels."""
+"""Frames: a scan composed of the frames of other scans, for example of its parts. Pixels and the table may be
+changed.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +15,9 @@ from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import WHOLE, ScanSource, frame_indices
 
 Read = Callable[..., NDArray[Any]]
-"""What `ScanSource.read` is: pixels [frame, row, col] of some frames and rows."""
+"""The type of `ScanSource.read`: returns the pixels [frame, row, col] of some frames and rows."""
 Pixels = Callable[[Read, slice | ArrayLike, slice], NDArray[Any]]
-"""Pixels of some frames and rows, from those that the first argument reads."""
+"""A function that returns changed pixels of some frames and rows. Its first argument reads the original pixels."""
 Change = Callable[[FrameTable], FrameTable]
 _COPIED = {*ScanSource.__annotations__} - {"table", "unreadable", "facts", "stated_ending", "decisions"}
 
@@ -29,12 +31,13 @@ class Frames(ScanSource):
     def __init__(
         self, *sources: ScanSource, pixels: Pixels | None = None, table: Change | None = None, **own: Any
     ) -> None:
-        """Take over the present frames of `sources`, which are closed with it.
+        """Combine the present frames of `sources`. Closing this scan closes the sources.
 
         Args:
-            pixels: how they come from those of the sources; None: as they are.
-            table: in the same way.
-            own: attributes that differ: each a value, or a function of what the sources say.
+            pixels: function that computes the pixels from those of the sources; None: pixels are unchanged.
+            table: function that computes the table from the joined table of the sources; None: the table is unchanged.
+            own: attributes with other values than in the sources: each is a value, or a function of the value in the
+                sources.
         """
         self._sources, self._pixels, self._change, self._own = sources, pixels, table, own
         for name in _COPIED:
@@ -87,7 +90,9 @@ _JOINED: dict[str, Callable[[Any, NDArray[np.int64]], Any]] = {
     "decisions": lambda each, sizes: sum(each, ()),
     "checksummed": lambda each, sizes: all(each),
 }
-"""How what several sources say becomes one value; else it is that of the last."""
+"""How the values of several sources are combined to one value. Attributes that are not listed have the value of the
+last source.
+"""
 _PROPERTIES = (name for name, value in vars(ScanSource).items() if isinstance(value, property))
 for _name in ("decisions", *_PROPERTIES):
     setattr(Frames, _name, property(partial(Frames.known, name=_name)))

@@ -1,5 +1,5 @@
-"""Facts in NeXus files and where they are stored: the detector with frames and image keys, angles, pixel size,
-energy, a cone beam, and mirrored frames.
+"""Finds facts in NeXus files: the detector with its frames and image keys, angles, pixel size, energy, a cone beam, and
+mirrored frames.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from beamline.storage import datasets
 from beamline.storage.frame_table import kinds_of
 from beamline.storage.readers.orders import order_of_axes
 
-_LISTED = 6  # detectors, or lists of angles, that a sentence names
-_LONGEST = 100  # steps of a chain of transformations
+_LISTED = 6  # most detectors, or lists of angles, that a sentence names
+_LONGEST = 100  # most steps of a chain of transformations
 
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Paths in a file of the fields that are read; None for a missing one.
+    """The objects in a file that are read; None for a missing object.
 
     `sense` is -1 if the angles increase in the direction opposite to `sample/rotation_angle`.
     """
@@ -39,7 +39,7 @@ class Places:
 
     @property
     def keys(self) -> h5py.Dataset:
-        """The codes of the kinds of frames; if there are two lists, the one that also has alignment frames."""
+        """The codes of the kinds of frames. If the file has two lists, the one that also marks alignment frames."""
         return datasets.dataset(self.detector, "image_key_control") or self.image_key
 
     def kinds(self) -> NDArray[np.int32]:
@@ -48,7 +48,9 @@ class Places:
 
 
 def find(file: h5py.File) -> list[Places]:
-    """Every tomography entry of a file; [] if it has none. Raises DataError if the file with the frames is missing."""
+    """All tomography entries of a file; may be empty. Raises DataError if the frames are in another file that is
+    missing.
+    """
     places = []
     unresolved: list[str] = []
     for name in file:
@@ -84,13 +86,13 @@ def _link(group: h5py.Group, name: str) -> str:
 
 
 def _find_angle(entry: h5py.Group, detector: h5py.Group, n: int) -> tuple[h5py.Dataset | None, str, int]:
-    """The angles of n frames, why there are none, and their sense."""
+    """The angles of n frames, the reason if there are none, and their sense of rotation (1 or -1)."""
     angle = datasets.dataset(entry, "sample/rotation_angle")
     if angle is not None:
         return angle, "", 1
-    # Diamond: the NXdata named as the detector says which scanned axis goes with the frames.
+    # Diamond: the NXdata has the name of the detector, and states which scanned axis belongs to the frames.
     data = datasets.resolve(entry, str(detector.name).rsplit("/", 1)[1])
-    name = datasets.attribute(data, "axes") if isinstance(data, h5py.Group) else ""  # the first of the axes
+    name = datasets.attribute(data, "axes") if isinstance(data, h5py.Group) else ""  # the name of the first axis
     if isinstance(data, h5py.Group) and name and data.get(name, getlink=True) is not None:
         angle = datasets.dataset(data, name)
         return angle, "" if angle is not None else f"{_link(data, name)} does not exist", 1
@@ -107,11 +109,12 @@ def _find_angle(entry: h5py.Group, detector: h5py.Group, n: int) -> tuple[h5py.D
 
 
 def _rotations_of_sample(entry: h5py.Group) -> list[tuple[h5py.Dataset, int]]:
-    """The rotations with several angles that the sample depends on, and their sense: those that change, or else all.
+    """The rotations on which the sample depends and that have several angles, with their sense (1 or -1). If some of
+    them change, only those.
 
-    The chain of NXtransformations begins at `sample/depends_on` and continues with the attribute of each step; a step
-    may be a group with a `value`, such as NXpositioner and NXlog. The sense is that of the longest component of the
-    vector.
+    The chain of NXtransformations begins at `sample/depends_on`. The attribute `depends_on` of each step names the next
+    step. A step may be a group with a `value`, such as NXpositioner and NXlog. The sense is the sign of the largest
+    component of the vector of the rotation.
     """
     here, where, steps, rotations = (
         datasets.resolve(entry, "sample"),
@@ -131,27 +134,29 @@ def _rotations_of_sample(entry: h5py.Group) -> list[tuple[h5py.Dataset, int]]:
     return changing or rotations
 
 
-def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Places:
+def choose(file: h5py.File, detectors: list[Places], data: str | None = None) -> Places:
     """The one detector to read: the one whose frames are `data`, or the one named by `default` of file and entry.
 
-    Raises DataError if there is none, or if several fit.
+    Raises DataError if no detector, or more than one, fits.
     """
-    if not found:
+    if not detectors:
         raise DataError(f"{file.filename} has no NXdetector with frames [frame, row, col] and an image_key.")
     if data is not None:
-        return next(places for places in found if places.data == datasets.resolve(file, data))
-    if len(found) == 1:
-        return found[0]
+        return next(places for places in detectors if places.data == datasets.resolve(file, data))
+    if len(detectors) == 1:
+        return detectors[0]
     default = datasets.attribute(file, "default").strip("/")
-    named = [places for places in found if str(places.entry.name).strip("/") == default]
+    named = [places for places in detectors if str(places.entry.name).strip("/") == default]
     plotted = [places for places in named if _is_default(places)]
     for some in (named, plotted):
         if len(some) == 1:
             return some[0]
-    names = ", ".join(f"{places.data.name} ({' x '.join(map(str, places.data.shape))})" for places in found[:_LISTED])
+    names = ", ".join(
+        f"{places.data.name} ({' x '.join(map(str, places.data.shape))})" for places in detectors[:_LISTED]
+    )
     raise DataError(
         f"{file.filename} has several detectors with frames, and no attribute `default` names one of "
-        f"them: {names}. Choose one: --data-path {found[0].data.name}."
+        f"them: {names}. Choose one: --data-path {detectors[0].data.name}."
     )
 
 
@@ -165,8 +170,8 @@ def _is_default(places: Places) -> bool:
     return bool(datasets.dataset(data, signal) == places.data)
 
 
-_MAGNIFIED = 0.01  # a pixel size is not known better
-_DIVERGED = 0.5  # px by which a ray leaves its parallel across the whole field, before a beam is a cone
+_MAGNIFIED = 0.01  # relative precision of a stated pixel size
+_DIVERGED = 0.5  # px: if a ray deviates by more across the whole field of view, the beam is a cone and not parallel
 _HC = 12.398419843320026  # keV Å
 _BEAMS = ("instrument/beam", "beam", "sample/beam")
 _MONOCHROMATOR = "instrument/monochromator"
@@ -174,13 +179,14 @@ _MONOCHROMATOR = "instrument/monochromator"
 
 @dataclass(frozen=True)
 class NexusGeometry:
-    """The geometry stated by a file; None for what it does not state.
+    """The geometry that a file states; None for values that it does not state.
 
     Attributes:
-        pixel_mm: (width, height) of a pixel: at the sample, of a cone on the detector.
+        pixel_mm: (width, height) of a pixel; for a parallel beam at the sample, for a cone beam on the detector.
         cone: mm from the source to the sample and to the detector; None also for a beam that is practically parallel.
-        central_ray: (row, column) where it meets the detector, counted as frames are read; NaN if it is not stated.
-        mirrored: (rows, columns) of the frames are in reverse order.
+        central_ray: (row, column) at which the central ray meets the detector, in the frames as this program reads
+            them; NaN if it is not stated.
+        mirrored: whether (rows, columns) of the frames are stored in reverse order.
         turned: rotations of the detector that are not used, as text; "" for none.
         remarks: sentences by name, for `info`.
     """
@@ -197,14 +203,14 @@ def read_geometry(places: Places) -> NexusGeometry:
     """The geometry of a file of another program.
 
     Raises:
-        DataError: impossible distances.
+        DataError: the distances are impossible.
     """
     detector, entry = places.detector, places.entry
     own = [datasets.scalar(detector, f"{side}_pixel_size", datasets.LENGTH_UNITS) for side in "xy"]
     at_sample = [datasets.scalar(entry, f"sample/{side}_pixel_size", datasets.LENGTH_UNITS) for side in "xy"]
     pixels = [theirs or ours for theirs, ours in zip(at_sample, own, strict=True)]
     cone, remarks = _cone_of(places, own[0], at_sample[0])
-    if cone is not None:  # on the detector
+    if cone is not None:  # size on the detector
         sod, sdd = cone
         pixels = [theirs * sdd / sod if theirs else ours for theirs, ours in zip(at_sample, own, strict=True)]
     mirrored, turned = _mirrored(detector)
@@ -216,17 +222,21 @@ def read_geometry(places: Places) -> NexusGeometry:
 
 
 def _central(places: Places, along: int, pitch: float | None, reverse: bool) -> float:
-    """The pixel along x (0) or y (1) that the central ray meets, stated in mm or in pixels; NaN: not stated."""
+    """Where the central ray meets the detector along x (0) or y (1), in pixels. The file may state it in mm or in
+    pixels; NaN if it does not.
+    """
     pixels = {"": 1.0, "px": 1.0, "pixel": 1.0}
     pixels |= {name: mm / pitch for name, mm in datasets.LENGTH_UNITS.items()} if pitch else {}
-    at = datasets.scalar(places.detector, f"beam_center_{'xy'[along]}", pixels)
-    return math.nan if at is None else places.data.shape[2 - along] - 1 - at if reverse else at
+    pixel = datasets.scalar(places.detector, f"beam_center_{'xy'[along]}", pixels)
+    return math.nan if pixel is None else places.data.shape[2 - along] - 1 - pixel if reverse else pixel
 
 
 def _cone_of(
     places: Places, own: float | None, at_sample: float | None
 ) -> tuple[tuple[float, float] | None, dict[str, str]]:
-    """The cone of `NexusGeometry`, and a remark on a beam that is practically parallel; widths of a pixel in mm."""
+    """The value `cone` of `NexusGeometry`, and a remark if the beam is practically parallel. Widths of pixels are in
+    mm.
+    """
     upstream, beyond = (
         _source_distance(places.entry),
         datasets.scalar(places.detector, "distance", datasets.LENGTH_UNITS),
@@ -305,7 +315,9 @@ def _energies(entry: h5py.Group, n: int) -> NDArray[np.float64] | None:
 
 
 def _source_distance(entry: h5py.Group) -> float | None:
-    """mm, negative in front of the sample, as NXsource defines it; some programs write it without the sign."""
+    """The distance of the source in mm. NXsource defines it as negative in front of the sample, but some programs omit
+    the sign.
+    """
     instrument = datasets.resolve(entry, "instrument")
     for group in groups(instrument):
         if datasets.attribute(group, "NX_class") == "NXsource" or str(group.name).endswith("/source"):
@@ -316,10 +328,12 @@ def _source_distance(entry: h5py.Group) -> float | None:
 
 
 def _mirrored(detector: h5py.Group) -> tuple[tuple[bool, bool], str]:
-    """(rows, columns) in reverse order, by flags or by half turns of the detector; other turns as text.
+    """Whether (rows, columns) are stored in reverse order, from flags or from rotations of the detector by 180°. Other
+    rotations are returned as text.
 
-    A half turn about the vertical mirrors left to right, one about the horizontal across the beam upside down, and one
-    about the beam both. The vertical is where gravity points, z or y; the beam is then x or z (ESRF's or McStas' axes).
+    A rotation by 180° about the vertical axis mirrors left and right. About the horizontal axis across the beam it
+    mirrors top and bottom, and about the beam it mirrors both. The vertical axis is the one along which gravity points:
+    z, with the beam along x (axes of ESRF), or y, with the beam along z (axes of McStas).
     """
     rows, cols = (_flag(detector, name) for name in ("y_flipped", "x_flipped"))
     if rows or cols:
@@ -335,12 +349,12 @@ def _mirrored(detector: h5py.Group) -> tuple[tuple[bool, bool], str]:
             others.append(f"{name} {angle:g}°")
             continue
         rows ^= axis != vertical
-        cols ^= axis in (vertical, 0 if vertical == 2 else 2)  # the beam
+        cols ^= axis in (vertical, 0 if vertical == 2 else 2)  # about the beam
     return (rows, cols), ", ".join(others)
 
 
 def _rotations(turns: h5py.Group) -> Iterator[tuple[str, float, int | None]]:
-    """Names, degrees and axes (of x, y, z; None: another) of the rotations that turn a detector."""
+    """Name, angle in degrees, and axis of each rotation of a detector. The axis is x, y or z; None: any other axis."""
     for name in turns:
         item = datasets.dataset(turns, name)
         if item is None or datasets.attribute(item, "transformation_type") != "rotation" or item.size != 1:
@@ -358,7 +372,7 @@ def _flag(detector: h5py.Group, name: str) -> bool:
 
 
 def _direction(item: h5py.Dataset) -> int | None:
-    """Which of x, y, z the attribute `vector` is parallel to; None if to none of them."""
+    """The axis (x, y or z) to which the attribute `vector` is parallel; None if it is not parallel to any of them."""
     vector = np.ravel(np.asarray(item.attrs.get("vector", ())))
     if vector.dtype.kind not in "iuf":
         return None

@@ -16,17 +16,19 @@ from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
 from recon.base.views import spread
 
-_LOOKED_AT = 3  # frames of a kind
-_SATURATED = 1e-3  # of the pixels, from which light, and no gap, is at the end of a type; as the limit of flats
-_UNLIT = 0.05  # of the bright part of a flat: darker pixels tell little of the noise of light
-_PHOTONS = 0.02  # by which the variance of counted photons may differ from their mean, in addition to its own error
-_ERRORS = 2.5  # standard deviations of that error
-_FEWEST = 2000  # pairs of pixels, from which a variance is known to 3 %
+_LOOKED_AT = 3  # frames of each kind that are examined
+# share of the pixels: if more of them have the largest value of their type, the cause is light and not a gap
+_SATURATED = 1e-3
+_UNLIT = 0.05  # share of the bright part of a flat; the noise of darker pixels is mostly not that of light
+# relative difference allowed between variance and mean of counted photons, in addition to the statistical error
+_PHOTONS = 0.02
+_ERRORS = 2.5  # standard deviations of the statistical error that are allowed
+_FEWEST = 2000  # least number of pairs of pixels, from which a variance is known to 3 %
 
 
 def marked_source(base: ScanSource, no_data: Mask) -> tuple[ScanSource, bool]:
-    """A scan whose pixels without data are 0 in all frames, also in flats, so that they are replaced like pixels
-    without beam; and True for counted photons, whose dark is 0 and absent.
+    """A scan whose pixels without data are 0 in all frames, including flats, so that the correction replaces them like
+    pixels without beam. Also True if the pixels are counted photons, so that the dark is 0 and need not be measured.
     """
 
     def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:
@@ -44,13 +46,13 @@ def marked_source(base: ScanSource, no_data: Mask) -> tuple[ScanSource, bool]:
 
 
 def no_data_of(source: ScanSource) -> Mask | None:
-    """bool [row, col], pixels without data, from the file's mask, or because they are at the maximum of their type in
-    all frames.
+    """bool [row, col], True for pixels without data: those in the mask of the file, and those that have a marker value
+    in all frames.
 
-    Only integers have such markers: the largest value of an unsigned type, and values below 0 of the others. Pixels of
-    8 and 16 bits may also reach the largest value because they are saturated. For these types, only whole rows and
-    columns count as markers, and no other pixel may have the largest value. None if nothing is marked, or more than
-    half.
+    Only integers have marker values: the largest value of an unsigned type, and values below 0 of a signed type. Pixels
+    of 8 and 16 bits may also reach the largest value because they are saturated. For these types, only whole rows and
+    columns count as marked, and no other pixel may have the largest value. None if no pixel is marked, or more than
+    half of them.
     """
     if source.dtype.kind not in "iu":
         return None
@@ -69,7 +71,7 @@ def no_data_of(source: ScanSource) -> Mask | None:
 
 
 def _ends(source: ScanSource) -> list[Mask]:
-    """Pixels at the end of their type in sampled flats and projections; [] if one of these frames has none."""
+    """For each sampled flat and projection, the pixels with a marker value; [] if a frame has no such pixel."""
     ends = []
     for kind in (FrameKind.FLAT, FrameKind.PROJECTION):
         for row in spread(source.table.of_kind(kind), _LOOKED_AT):
@@ -80,14 +82,14 @@ def _ends(source: ScanSource) -> list[Mask]:
 
 
 def _end_in(source: ScanSource, row: int) -> Mask:
-    """Where one frame is at the end of its type; it is read in two halves, so that no more memory is needed."""
+    """The pixels of one frame that have a marker value. The frame is read in two halves to save memory."""
     half = source.shape[0] // 2
     parts = (read_known(source, [row], rows)[0] for rows in (slice(0, half), slice(half, source.shape[0])))
     return np.concatenate([part < 0 if part.dtype.kind == "i" else part == np.iinfo(part.dtype).max for part in parts])
 
 
 def counts_photons(source: ScanSource) -> bool:
-    """True if flats fluctuate like counted photons, with the variance of their mean, so that they have no offset.
+    """True if flats fluctuate like counted photons: their variance equals their mean, so the detector has no offset.
 
     For a camera, variance over mean is its gain times the share of the counts that comes from light. This share is
     smaller if there is less light, for example in dark corners. Therefore the brighter and the darker half of the

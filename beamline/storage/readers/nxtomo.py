@@ -51,16 +51,16 @@ class NexusSource(ScanSource):
     """A scan with the structure of NXtomo; see ScanSource."""
 
     def __init__(self, path: Path, file: h5py.File, own_angles: bool = True, data: str | None = None) -> None:
-        """Read the open file. `own_angles` False: the caller supplies the angles, so the file need not have any, or no
-        units.
+        """Read the open file. `own_angles` False: the caller supplies the angles, so the file need not contain angles,
+        or their unit.
 
-        `data`: where the frames are, if there are several detectors; None: those of the only one, or of the file's
-        default.
+        `data`: path of the frames, if the file has several detectors. None: the frames of the only detector, or of the
+            default in the file.
         """
         self.path, self._file, self._own_angles, self.n = path, file, own_angles, 0
         self._mirrored_by, self._remarks = (False, False), dict[str, str]()
-        found = find(file)
-        self._places = places = choose(file, found, data)
+        detectors = find(file)
+        self._places = places = choose(file, detectors, data)
         self._check()
         shape = places.data.shape
         self.shape = (int(shape[1]), int(shape[2]))
@@ -68,7 +68,8 @@ class NexusSource(ScanSource):
         self.format = format_of(places.entry)
         self.quantity = quantity_of(datasets.text_at(file, "/entry/record/quantity"), places.data.id.dtype)
         self.energy_kev = read_energy(places.entry)
-        # NXtomo's x_rotation_axis_pixel_position counts from the edge for some and from the middle for others.
+        # NXtomo's x_rotation_axis_pixel_position is not read: some programs count it from the edge, others from the
+        # middle.
         self.axis_col = datasets.scalar(file, "/entry/record/axis_col", {"pixel": 1.0})
         geometry = read_geometry(places)
         self._mirrored_by, self._remarks, self.cone = geometry.mirrored, geometry.remarks, geometry.cone
@@ -77,10 +78,12 @@ class NexusSource(ScanSource):
         self.row_pitch_mm = differing(height, self.pixel_size_mm)
         self.pixel_mask = self._mask()
         self.refresh()
-        self._find_unused(found if data is None else [], geometry.turned)
+        self._find_unused(detectors if data is None else [], geometry.turned)
 
     def _mask(self) -> Mask | None:
-        """Pixels that NXdetector's mask names, for any of its reasons; None without a mask of the frames' shape."""
+        """The pixels that the mask of NXdetector marks for any reason. None if there is no mask with the shape of the
+        frames.
+        """
         item = datasets.dataset(self._places.detector, "pixel_mask")
         if item is None or item.shape[-2:] != self.shape or item.dtype.kind not in "uib":
             return None
@@ -113,7 +116,7 @@ class NexusSource(ScanSource):
         angle = places.angle if self._own_angles else None
         there = [hdf5.n_written(each) for each in (places.data, angle) if each is not None]
         n = len(places.data) if ended else min(*there, len(keys))
-        angles = np.full(n, np.nan) if angle is None else places.sense * datasets.radians(angle) + 0.0  # no -0
+        angles = np.full(n, np.nan) if angle is None else places.sense * datasets.radians(angle) + 0.0  # avoids -0
         kinds = kinds_of(np.ravel(datasets.values_of(keys)))
         sizes = (int(places.data.shape[0]), kinds.size, angles.size)
         if min(sizes) < n or (ended and max(sizes) > n):
@@ -122,7 +125,7 @@ class NexusSource(ScanSource):
             )
         self.n = n
         seconds, times = self._seconds(places.detector, "count_time"), self._seconds(places.entry, "frame_log/time")
-        exposures = np.where(seconds > 0, seconds, np.nan)  # some write 0 for what they do not know
+        exposures = np.where(seconds > 0, seconds, np.nan)  # some programs write 0 for an unknown value
         logged = {f"{name}s": self._column(f"frame_log/{name}") for name in ("trigger", "framestamp")}
         own = {name: column for name, column in logged.items() if column is not None}
         self.table = FrameTable.of(
@@ -162,10 +165,10 @@ class NexusSource(ScanSource):
         values = np.ravel(datasets.values_of(item))[: self.n].astype(np.float64)
         return np.where(values > 0, values, np.nan)
 
-    def _find_unused(self, found: list[Places], turned: str) -> None:
-        """Fields, other scans in the file, and turns of the detector that are stated and not used."""
+    def _find_unused(self, detectors: list[Places], turned: str) -> None:
+        """Find the fields, other scans and rotations of the detector that the file states and that are not used."""
         self.not_used += stated_in(NXTOMO, self._places.entry, self, str(self._places.detector.name))
-        for other in {str(each.data.name): each for each in found if each.data != self._places.data}.values():
+        for other in {str(each.data.name): each for each in detectors if each.data != self._places.data}.values():
             shape, where = " x ".join(map(str, other.data.shape)), str(other.data.name)
             why = f"it is another scan in this file; --data-path {where} selects it"
             self.not_used += (NotUsed(where, f"{shape} frames", why, True),)
@@ -191,7 +194,7 @@ class NexusSource(ScanSource):
         return block[:, [row - first for row in kept], :: -1 if left_to_right else 1]
 
     def _column(self, path: str) -> NDArray[np.int64] | None:
-        """Whole numbers [frame]; None if the file has no such list."""
+        """Integers [frame]; None if the file has no such list."""
         item = datasets.dataset(self._places.entry, path)
         values = None if item is None else np.asarray(datasets.values_of(item))
         if values is None or values.ndim != 1 or values.size < self.n or values.dtype.kind not in "ui":
@@ -199,7 +202,7 @@ class NexusSource(ScanSource):
         return values[: self.n].astype(np.int64)
 
     def _seconds(self, group: h5py.Group, path: str) -> NDArray[np.float64]:
-        """Seconds of each frame; NaN if the file states none."""
+        """Time of each frame in s; NaN if the file states no times."""
         values = datasets.in_units(datasets.dataset(group, path), datasets.TIME_UNITS)
         if values is None or 1 != values.size < self.n:
             return np.full(self.n, np.nan)
@@ -222,7 +225,7 @@ NUMBERS = (
     ("exposure_s", "record/exposure", datasets.TIME_UNITS),
     ("period_s", "record/period", datasets.TIME_UNITS),
     ("no_data", "record/no_data", {"": 1.0}),
-    ("saturation", "instrument/detector/saturation_value", {"": 1.0}),  # as NXdetector has it
+    ("saturation", "instrument/detector/saturation_value", {"": 1.0}),  # as NXdetector stores it
     ("saturation", "record/saturation", {"": 1.0}),
     ("distance_mm", "instrument/detector/distance", datasets.LENGTH_UNITS),
     ("source_distance_mm", "record/source_distance", datasets.LENGTH_UNITS),
@@ -231,14 +234,14 @@ NUMBERS = (
 
 
 def stated_facts(entry: h5py.Group, exposures: NDArray[np.float64]) -> dict[str, str | float | int]:
-    """What an entry states of the scan: sample, title, times, distances, exposure."""
+    """The facts of a scan in an entry: sample, title, times, distances, exposure."""
     facts: dict[str, str | float | int] = {}
-    for name, at in TEXTS.items():
-        value = datasets.text_at(entry, at)[: datasets.NAME]
+    for name, path in TEXTS.items():
+        value = datasets.text_at(entry, path)[: datasets.NAME]
         if value:
             facts[name] = value
-    for name, at, units in NUMBERS:
-        number = datasets.scalar(entry, at, units)
+    for name, path, units in NUMBERS:
+        number = datasets.scalar(entry, path, units)
         if number is not None:
             facts[name] = number
     if "exposure_s" not in facts and np.isfinite(exposures).any():
@@ -257,12 +260,12 @@ def format_of(entry: h5py.Group) -> str:
 
 
 def quantity_of(stated: str, dtype: np.dtype[Any]) -> Quantity:
-    """What the pixels are, from the word of this program's files, or from their type."""
+    """The quantity of the pixels: from the text in a file of this program, otherwise from the type of the pixels."""
     if stated == "line_integrals":
         return "line_integrals"
     return (
         "counts" if stated == "counts" or (not stated and dtype.kind in "iu") else "unknown"
-    )  # NXtomo: data are integers, as detected
+    )  # In NXtomo, data are integers as the detector counts them.
 
 
 def open_nxtomo(path: Path, *, follow: bool = False, own_angles: bool = True, data: str | None = None) -> NexusSource:
@@ -279,8 +282,8 @@ def _recognises(path: Path, opening: Opening) -> bool:
         return bool(find(file))
 
 
-def _at(path: Path, arrays: NamedArrays) -> NexusSource | None:
-    """The scan of the detector whose frames these are."""
+def _scan_of_arrays(path: Path, arrays: NamedArrays) -> NexusSource | None:
+    """The scan of the detector to which these frames belong."""
     if not arrays.alone or holds_arrays(path):
         return None
     with hdf5.open_hdf5(path) as file:
@@ -300,6 +303,6 @@ FORMAT = ScanFormat(
     "an NXdetector with frames and an image_key (NXtomo)",
     _recognises,
     lambda path, opening: open_nxtomo(path, follow=opening.follow, own_angles=opening.own_angles),
-    _at,
+    _scan_of_arrays,
     _references,
 )

@@ -41,9 +41,9 @@ from recon.base.views import spread
 
 __all__ = ["NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]
 
-_SIGNED = "i1", "i2", "i4"  # types that cameras' counts may not fit
-_LOOKED_AT = 3  # frames of a kind, for counts that wrapped
-_PIXELS = 2**27  # of a frame whose rows are all looked at
+_SIGNED = "i1", "i2", "i4"  # signed types, into which the counts of a camera may not fit
+_LOOKED_AT = 3  # frames of each kind that are examined for counts that overflowed
+_PIXELS = 2**27  # largest number of pixels of a frame of which all rows are examined
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,33 +53,34 @@ class SourceOptions:
     Attributes:
         path: HDF5 file (NXtomo, Diamond NeXus, Data Exchange), multi-page TIFF, folder or .zip of images, .npy, Zarr,
             .txrm, the folder of a scene of R²-Gaussian.
-        quantity: of the pixels, if the file does not state it; transmission (0 to 1) becomes counts with flats of 1 and
-            darks of 0.
-        angles: replace the file's. A file in degrees (a text with one per line, a table with a column for angles,
-            .npy), a list with a unit in an HDF5 file (FILE::NAME if there are several), or an array in radians. One
-            angle for each projection; or one for each frame, if the order of all frames is known; or one for each
-            number of a series of files, from its first to its last.
-        angle_rows: "a:b", which rows of these angles (or of the angle file next to a TIFF series) are those of the
+        quantity: quantity of the pixels, if the file does not state it. Transmission (0 to 1) becomes counts with flats
+            of 1 and darks of 0.
+        angles: replace the angles in the file. Give a file in degrees (a text with one angle per line, a table with a
+            column of angles, an .npy), a list with a unit in an HDF5 file (FILE::NAME if there are several), or an
+            array in radians. There is one angle for each projection; or one for each frame, if the order of all frames
+            is known; or one for each number of a series of files, from the first number to the last.
+        angle_rows: "a:b", the rows of these angles (or of the angle file next to a TIFF series) that belong to the
             projections.
-        darks, flats: replace the file's; they come before its frames. An array, TIFFs, or a separate HDF5 file
-            (FILE::DATASET if it has several).
-        data_path: in an HDF5 file of any layout: where its projections [frame, row, col] are; in an NXtomo with several
-            detectors: where the frames of one are.
-        darks_path, flats_path: for `data_path`: where its darks and flats are.
-        angles_path: in any HDF5 file: where the angles are, instead of `angles`.
-        angles_unit: "deg" or "rad", of these or of `angles`, instead of the unit that the file states.
+        darks, flats: replace the darks and flats in the file. They come before the frames of the file. Give an array,
+            TIFFs, or a separate HDF5 file (FILE::DATASET if it has several datasets).
+        data_path: path of the projections [frame, row, col] in an HDF5 file of any layout. In an NXtomo with several
+            detectors, path of the frames of one detector.
+        darks_path, flats_path: paths of the darks and flats that belong to `data_path`.
+        angles_path: path of the angles in any HDF5 file, instead of `angles`.
+        angles_unit: "deg" or "rad": unit of the angles from `angles_path` or `angles`. It replaces the unit that the
+            file states.
         order: of the dimensions of the projections, such as "row,view,col" for a stack of sinograms, or "view,col" for
             one sinogram; also for a series of image files.
         earlier: finished files of the same scan; their frames come before those of `path`.
-        horizontal_axis: the rotation axis is parallel to the rows: frames are rotated by 90 degrees.
+        horizontal_axis: True if the rotation axis is parallel to the rows. Frames are then rotated by 90 degrees.
         frames: "darks=0:5,flats=5:10": the kind of frames, by their rows; all others are projections. Names of files in
-            a folder are then not used for that. "0::2": every second projection, see `transforms.selected`.
+            a folder then do not decide the kind. "0::2" selects every second projection, see `transforms.selected`.
         then: further files of the same scan, whose frames follow.
-        side_file: settings file of the scanner's maker: distances, pixel size, angles and white level, see
+        side_file: settings file of the manufacturer, with distances, pixel size, angles and white level; see
             `side_files`.
-        cols: (first, end) columns of the detector; the scan is read as if it had no others.
-        frames_per_view: consecutive projections that are averaged to one; None: the number that the plan in the file
-            states.
+        cols: (first, end) columns of the detector; the scan is read as if it had no other columns.
+        frames_per_view: number of consecutive frames that are averaged to one projection; None: the number in the plan
+            of the file.
     """
 
     path: Path | str
@@ -104,7 +105,7 @@ class SourceOptions:
 
     @property
     def stated(self) -> bool:
-        """True if the caller states more about the scan than its path: then it cannot be a volume."""
+        """True if the caller states more than the path. Then the path cannot be that of a volume."""
         return any(getattr(self, field.name) is not field.default for field in fields(self)[1:])
 
     def open(self, *, follow: bool = False) -> ScanSource:
@@ -120,9 +121,9 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         follow: the file may still be growing; refresh() then finds new frames.
 
     Raises:
-        DataError: the file does not exist, has no supported format, or is not consistent; the message says what was
+        DataError: the file does not exist, has no supported format, or contradicts itself. The message says what was
             found.
-        ConfigError: columns outside the detector; a number of frames per projection that is less than 1.
+        ConfigError: columns lie outside the detector, or the number of frames per projection is less than 1.
         NotReadyError (a DataError, `follow` only): the file does not exist yet or is just being created; try again.
     """
     options = scan if isinstance(scan, SourceOptions) else SourceOptions(scan)
@@ -143,7 +144,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
 
 
 def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
-    """The frames of all files, of the kinds that the caller says."""
+    """The frames of all files, with the kinds that the caller states."""
     kinds, _ = kinds_and_views(options.frames)
     own_angles, given = options.angles is None and options.angles_path is None, (options.darks, options.flats)
     kinds = None if only_omits(kinds) else kinds
@@ -170,7 +171,7 @@ def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
 
 
 def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
-    """The scan with what the caller says instead of its files."""
+    """The scan, with the values that the caller states instead of the values in the files."""
     side = None if options.side_file is None else read_side_file(options.side_file)
     if side is not None:
         base = with_side_file(base, side)
@@ -178,14 +179,16 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     kinds, views = kinds_and_views(options.frames)
     angles, angles_from = _angle_table(options, base, side)
     kept = with_kinds(base, kinds) if kinds is not None and only_omits(kinds) else None
-    listed = kept is None or angles is None or angles.size != kept.table.views.size  # also those that are left out
+    # frames that are left out are included here
+    listed = kept is None or angles is None or angles.size != kept.table.views.size
     base = base if listed or kept is None else kept
     base = with_order(
         base, options.order if options.data_path is None else None, None if angles is None else angles.size
     )
     if angles is not None:
         of_each = n if views is None else views.step or 1
-        if angles.size * of_each == base.table.views.size:  # one for each projection applies to its frames
+        # if there is one value for each projection, it applies to the frames of the projection
+        if angles.size * of_each == base.table.views.size:
             angles = np.repeat(angles, of_each)
         assigned = assign(base, angles, angles_from, of_views=options.angle_rows is not None)
         base = Frames(base, table=lambda known: replace(known, angles=assigned))
@@ -204,10 +207,10 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
 
 
 def _with_references(base: ScanSource, options: SourceOptions, side: SideFile | None, *, replaced: bool) -> ScanSource:
-    """The scan with the darks, flats and quantity that the caller states, and without pixels that have no data.
+    """The scan with the darks, flats and quantity that the caller states. Pixels without data are marked.
 
     Args:
-        replaced: the caller states something else of its frames.
+        replaced: True if the caller states something else about the frames.
     """
     quantity = options.quantity
     darks, flats = stated_references(
@@ -230,7 +233,9 @@ def _with_references(base: ScanSource, options: SourceOptions, side: SideFile | 
 def _angle_table(
     options: SourceOptions, base: ScanSource, side: SideFile | None
 ) -> tuple[NDArray[np.float64] | None, str]:
-    """The angles that are given, or that lie next to a TIFF series, and where they come from; None: the scan's own."""
+    """The angles from the caller or from a file next to a TIFF series, and their origin. None: the angles in the scan
+    are used.
+    """
     table = None if options.angles is None else load_angles(options.angles, options.angles_unit)
     origin = str(options.angles) if isinstance(options.angles, Path | str) else "The array of angles"
     if options.angles_path is not None:
@@ -249,8 +254,8 @@ def _angle_table(
 
 
 def _true_type(source: ScanSource) -> np.dtype[Any] | None:
-    """The type that pixels really have: real numbers stored as integers, or unsigned counts that overflowed, wide
-    enough for all of them; None: as stored.
+    """The true type of the pixels, if they are real numbers stored as integers, or unsigned counts that overflowed. The
+    type can represent all frames. None: the stored type is right.
     """
     if source.dtype.kind == "u":
         some = [each for each in _some_of_each_kind(source) if each.any()]
@@ -268,12 +273,12 @@ def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
         if rows.size:
             some = spread(rows, _LOOKED_AT)
             every = max(1, source.shape[0] * source.shape[1] // _PIXELS, source.frame_bytes // UNPACKED)
-            with suppress(DataError):  # what cannot be read is told where it is used
+            with suppress(DataError):  # an unreadable frame is reported where it is used
                 yield read_known(source, some[:1] if every > 1 else some, slice(None, None, every))
 
 
 def _refuse(options: SourceOptions, follow: bool) -> None:
-    """DataError for options that exclude each other."""
+    """Raise DataError for options that exclude each other."""
     own = ("angles", "darks", "flats", "data_path", "angles_path")
     replaced = [f"--{name.replace('_', '-')}" for name in own if getattr(options, name) is not None]
     own_kinds = {"horizontal-axis": options.horizontal_axis, "frames": options.frames, "append": options.then}

@@ -1,5 +1,5 @@
-"""Order of dimensions: which dimensions of an array are frames, rows and columns, from what the file or the user
-states and from the shapes.
+"""Order of dimensions: decides which dimensions of an array are frames, rows and columns, from what the file or the
+user states, and from the shapes.
 """
 
 from __future__ import annotations
@@ -20,11 +20,15 @@ from beamline.storage.readers.frames import Frames, Read
 from beamline.storage.writers.rows import ScanEnding
 
 Order = tuple[int | None, int | None, int | None]
-"""Which dimensions of an array are frames, rows and columns; None: one of length one that it does not have."""
+"""The numbers of the dimensions that are frames, rows and columns. None: the array does not have this dimension; its
+length counts as one.
+"""
 
 
 class TurnedFrames:
-    """An array read as [frame, row, col], for any order of its dimensions; additional ones have length one."""
+    """An array that is read as [frame, row, col], whatever the order of its dimensions is. Additional dimensions must
+    have length one.
+    """
 
     def __init__(self, item: Any, order: Order) -> None:
         self.item, self._order = item, order
@@ -36,7 +40,7 @@ class TurnedFrames:
 
     @property
     def frame_bytes(self) -> int:
-        """Bytes that are decompressed to read a frame."""
+        """Number of bytes that are decompressed to read a frame."""
         return bytes_unpacked(self.item, self._order[0])
 
     def __len__(self) -> int:
@@ -56,7 +60,7 @@ class TurnedFrames:
 
 
 def order_of_axes(axes: Sequence[str]) -> Order | None:
-    """Which of two or three named dimensions are frames, rows and columns; None if the names do not tell.
+    """Which of two or three named dimensions are frames, rows and columns; None if this is not clear from the names.
 
     x, u, columns or horizontal are columns; y, v or rows are rows; any other name (theta, rotation_angle) means frames.
     """
@@ -80,8 +84,8 @@ SINOGRAM = (0, None, 1)
 
 
 def dimensions_without_ones(shape: tuple[int, ...], n: int = 3) -> dict[int, int]:
-    """The n dimensions of a shape, length by place. Surplus dimensions must have length one. The last dimension is
-    dropped first, if it cannot be that of the columns; then the first dimension.
+    """The lengths of n dimensions of a shape, by their numbers. Surplus dimensions must have length one. If the last
+    dimension has length one, it is dropped first; otherwise the first dimension with length one is dropped.
     """
     sizes = dict(enumerate(shape))
     while len(sizes) > n and 1 in sizes.values():
@@ -91,7 +95,7 @@ def dimensions_without_ones(shape: tuple[int, ...], n: int = 3) -> dict[int, int
 
 
 def as_frames(item: Any, order: Order = USUAL) -> Any:
-    """An array as frames [frame, row, col]; also one image, which has no dimension of frames."""
+    """An array as frames [frame, row, col]. A single image, without a dimension of frames, is accepted, too."""
     n = 3 - order.count(None)
     if isinstance(item, h5py.Dataset) and order == USUAL and item.ndim == n:
         return item
@@ -104,13 +108,13 @@ def as_frames(item: Any, order: Order = USUAL) -> Any:
 
 
 def _with_axes(new: Mapping[int, int], order: Order) -> Order:
-    """The order with other numbers of the dimensions; dimensions without a number are dropped."""
+    """The same order with new numbers for the dimensions. Dimensions without a new number are dropped."""
     frames, rows, cols = (None if axis is None else new.get(axis) for axis in order)
     return frames, rows, cols
 
 
 def stated_order(names: str) -> Order:
-    """The order that a caller states, as in "row,view,col". DataError for another text."""
+    """The order that a caller states, such as "row,view,col". Raises DataError for any other text."""
     if (order := order_of_axes(names.split(","))) is None:
         raise DataError(
             f"The dimensions are given as {names}; expected those of the array, such as frame,row,col, or "
@@ -122,10 +126,11 @@ def stated_order(names: str) -> Order:
 def order_by_shapes(
     views: tuple[int, ...], references: list[tuple[int, ...]], n_angles: int | None, *, matlab: bool
 ) -> Order:
-    """Which dimensions are frames, rows and columns, from the shapes of darks and flats and the number of angles.
+    """Decide which dimensions are frames, rows and columns, from the shapes of darks and flats, and from the number of
+    angles.
 
-    MATLAB's first dimension is the last one here, and in its images rows come before columns. Stacks with the
-    projections in the middle are sinograms, as in ASTRA, with columns first.
+    MATLAB writes dimensions in reverse order, and the dimension of rows comes before that of columns in its images. If
+    the projections are the middle dimension, the stack consists of sinograms, as in ASTRA, with columns first.
     """
     if len(views) != 3:
         lines = len(views) == 2 and any(shape[-1:] == views[-1:] and shape != views for shape in references)
@@ -142,18 +147,18 @@ def order_by_shapes(
 
 
 def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> ScanSource:
-    """A scan read from images whose dimensions, one image after the other, are those of `order`: "row,view,col".
+    """A scan whose images are stacked to an array with the dimensions in `order`, such as "row,view,col".
 
     Args:
-        order: None: the images are projections, with one exception. They are a sinogram if there is one image, or
-            images of one row or column, and another dimension is as long as the list of angles.
+        order: None: the images are projections, with one exception. If there is only one image, or each image has only
+            one row or column, and another dimension is as long as the list of angles, the images are a sinogram.
 
     Raises:
-        DataError: some of the images are darks or flats, or they have other dimensions; or a sinogram is square.
+        DataError: some of the images are darks or flats, the dimensions do not fit, or a sinogram is square.
     """
     sizes, alike = (len(base.table), *base.shape), base.table.are_views.all()
     fits = [axis for axis, n in enumerate(sizes) if n == n_angles]
-    counted = base.table.numbers is not None and sizes[0] > 1  # images that are files of a series are projections
+    counted = base.table.numbers is not None and sizes[0] > 1  # image files of a series are projections
     if order is None and (1 not in sizes or n_angles in (1, sizes[0]) or not fits or not alike or counted):
         return base
     if order is None and len(fits) > 1:

@@ -29,10 +29,14 @@ from beamline.storage.writers.rows import RUNNING, ScanEnding, ending_in
 
 
 class OwnScan(ScanSource):
-    """The frames of a scan file of this program that its writer has marked as complete; see ScanSource."""
+    """The frames of a scan file of this program. Only frames that the writer has marked as complete are read. See
+    ScanSource.
+    """
 
     def __init__(self, scan: ScanFile) -> None:
-        """Take over an open file. Raises DataError if it does not have what its writer promises."""
+        """Read an open file, which this object closes later. Raises DataError if something is missing that a writer
+        always stores.
+        """
         file, entry = scan.file, scan.file[layout.ENTRY]
         self.path, self._scan, self._damaged = scan.path, scan, set[int]()
         self._checksums: NDArray[np.int64] | None = None
@@ -80,15 +84,15 @@ class OwnScan(ScanSource):
         scan, known = self._scan, len(self.table)
         if (n := scan.committed()) > known or not n or self.finished:
             flags = read_flags(scan.file, n)
-            stated = self.plan or flags.flagged.any()  # a copy has none to say
+            stated = self.plan or flags.flagged.any()  # a copy has neither
             self.table = replace(frames_in(scan.file, n), flags=flags if stated else None)
-        else:  # of frames that were there nothing else is used before the end
+        else:  # no new frames: before the end, only pass ends can have changed
             self.table = replace(self.table, pass_ends=pass_ends_in(scan.file))
         self.decisions, self._checksums = decisions_in(scan.file), self._stored_checksums(n)
         return n
 
     def _stored_checksums(self, n: int) -> NDArray[np.int64] | None:
-        """The checksums of the pixels of n frames; None if the file does not have a list of them."""
+        """The checksums of the pixels of n frames; None if the file has no checksums."""
         values = np.asarray(self._scan.values(PIXEL_CHECKSUM)) if PIXEL_CHECKSUM in self._scan.file else np.zeros(0)
         listed = values.ndim == 1 and values.size >= n and values.dtype.kind in "ui"
         return values[:n].astype(np.int64) if listed else None
@@ -145,7 +149,7 @@ class OwnScan(ScanSource):
         return frozenset(self._damaged)
 
     def holds(self, path: str) -> bool:
-        """True if the dataset at this path is that of the frames."""
+        """True if the dataset at this path contains the frames."""
         return bool(datasets.resolve(self._scan.file, path) == self._scan.data)
 
     def close(self) -> None:
@@ -156,7 +160,9 @@ PIXEL_CHECKSUM = "/entry/digest/checksum"
 
 
 def open_own(path: Path, follow: bool = False) -> OwnScan | None:
-    """The scan in a file of this program; None if another program wrote it. Errors: as `scan_file.opened`."""
+    """The scan in a file of this program; None if another program wrote the file. Raises the same errors as
+    `scan_file.opened`.
+    """
     scan = scan_file.opened(path, follow)
     if scan is None:
         return None

@@ -37,21 +37,24 @@ from beamline.storage.readers.transforms import real_type, type_wrapped, unsigne
 from drivers.base.frame import FrameKind
 
 Images = Path | str | NDArray[Any]
-"""A TIFF, a folder of images, an HDF5 file, .npy, .npz or Zarr (`FILE::DATASET` where it has several), an array
-[frame, row, col], or a whole number, the counts of every pixel, unless a file has it as its name."""
+"""Where darks or flats come from. A TIFF, a folder of images, or an HDF5 file, .npy, .npz or Zarr (`FILE::DATASET` if
+it has several datasets). An array [frame, row, col]. Or an integer: the counts of every pixel, unless a file with this
+name exists.
+"""
 
 
 def stated_references(
     base: ScanSource, quantity: Stated | None, given: tuple[Images | None, Images | None], white: float | None
 ) -> tuple[Images | None, Images | None]:
-    """The darks and flats that replace those of the scan (for transmission: 0 and 1); None: those of the scan are used.
+    """The darks and flats that replace those of the scan. For transmission they are 0 and 1. None: those of the scan
+    are used.
 
     Args:
         given: darks and flats that the caller gives.
-        white: counts of the open beam from the maker's file.
+        white: counts of the open beam from the settings file of the manufacturer.
 
     Raises:
-        DataError: the pixels cannot be transmission.
+        DataError: the values of the pixels cannot be transmission.
     """
     darks, flats = given
     nothing = np.zeros((1, *base.shape), base.dtype)
@@ -75,21 +78,21 @@ def stated_references(
 
 
 _EXCHANGE = {FrameKind.DARK: "exchange/data_dark", FrameKind.FLAT: "exchange/data_white"}
-_LISTED = 8  # datasets that an error names
+_LISTED = 8  # most datasets that an error names
 
 
 def load_images(images: Images, kind: FrameKind, shape: tuple[int, int] | None = None) -> NDArray[Any]:
     """Read darks or flats [frame, row, col] into memory.
 
-    In an HDF5 file these are the dataset that is named, or the frames of this kind according to its image_key, or those
-    of Data Exchange, or the only images of this shape.
+    In an HDF5 file, these are the first of the following that exists: the named dataset, the frames of this kind
+    according to image_key, the frames of this kind in Data Exchange, or the only images of this shape.
 
     Args:
         kind: DARK or FLAT.
         shape: (rows, cols) of the scan's frames; None: any.
 
     Raises:
-        DataError: the images cannot be read, are not images, or several datasets could be meant.
+        DataError: the data cannot be read or are not images, or it is unclear which of several datasets is meant.
     """
     if not isinstance(images, Path | str):
         return _stack(np.asarray(images), "The array of reference frames")
@@ -115,7 +118,7 @@ def load_images(images: Images, kind: FrameKind, shape: tuple[int, int] | None =
 
 
 def _in_rows(images: NDArray[Any], shape: tuple[int, int] | None) -> NDArray[Any]:
-    """References of a detector of one row, [frame, col], as frames of one row."""
+    """Darks or flats of a detector with one row, [frame, col], as frames with one row."""
     lines = shape is not None and len(images) == shape[0] == 1 < images.shape[1] and images.shape[2] == shape[1]
     return images.swapaxes(0, 1) if lines else images
 
@@ -144,7 +147,7 @@ def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: 
     if dataset:
         return _read(path, dataset_at(file, dataset))
     if (scan := references_in(path, file, kind)) is not None:
-        with scan:  # as the reader of its format gives them, mirrored and turned as the file says
+        with scan:  # as the reader of this format returns them: mirrored and rotated as the file states
             return _stack(scan.read(scan.table.of_kind(kind)), str(path))
     exchange = datasets.dataset(file, _EXCHANGE[kind])
     if exchange is not None:
@@ -164,18 +167,20 @@ def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: 
 
 
 def _numbered(file: h5py.File, kind: FrameKind, shape: tuple[int, int] | None) -> dict[int, h5py.Dataset]:
-    """The images of a kind by the frames before which they were taken, as BLISS and nabu keep them: /entry/flats/0 and
-    /entry/flats/89."""
+    """The images of one kind, by the number of the frame before which they were taken. BLISS and nabu store them under
+    such numbers: /entry/flats/0 and /entry/flats/89.
+    """
     named = [(str(item.name).rpartition("/"), item) for item in _images(file) if shape in (None, item.shape[-2:])]
     ours = [(of, number, item) for (of, _, number), item in named if number.isdecimal() and kind.name.lower() in of]
     return {int(number): item for _, number, item in ours} if len({of for of, *_ in ours}) == 1 else {}
 
 
 def places_of_flats(images: Images | None, shape: tuple[int, int], n: int) -> NDArray[np.float64] | None:
-    """Where in a scan of n frames, from its first (0) to its last (1), each of the flats in a file was taken; None: not
+    """When each of the flats in a file was taken, from 0 (first frame of the scan) to 1 (last of n frames). None: not
     stated.
 
-    If numbers exceed n, they also count other frames: then the first flat is assumed at the first frame.
+    If the stored numbers exceed n, they also count other frames. The first flat is then assumed to be at the first
+    frame.
     """
     if not isinstance(images, Path | str) or not Path(images).is_file() or not hdf5.is_hdf5(Path(images)):
         return None
@@ -188,7 +193,7 @@ def places_of_flats(images: Images | None, shape: tuple[int, int], n: int) -> ND
 
 
 def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
-    """Every dataset that may be images, once, also behind links."""
+    """Yields every dataset that may contain images. Links are followed, and each dataset is returned once."""
     return (item for item in datasets.arrays_in(file, (2, 3, 4)) if min(item.shape[-2:]) > 1)
 
 
@@ -224,17 +229,17 @@ def overlaid(
     quantity: Quantity | None = None,
     places: NDArray[np.float64] | None = None,
 ) -> ScanSource:
-    """A scan with further darks and flats in front: darks, flats, then the frames of `base`.
+    """A scan with additional darks and flats at its beginning: darks, flats, then the frames of `base`.
 
-    If darks (flats) are given, those of `base` become INVALID: they stay in place, unused. Added flats are valid for
-    all parts of the scan. All frames have one dtype, as of one camera.
+    If darks (or flats) are given, the darks (or flats) of `base` become INVALID: they stay in the table but are not
+    used. Added flats apply to all parts of the scan. All frames get the same dtype.
 
     Args:
         darks, flats: [frame, row, col].
-        places: of the flats in the scan, from its first frame (0) to its last (1); None: before it.
+        places: when each flat was taken, from 0 (first frame of the scan) to 1 (last frame); None: before the scan.
 
     Raises:
-        DataError: shapes or counts do not fit.
+        DataError: the shapes or the numbers of frames do not fit.
     """
     given = {kind: images for kind, images in zip(_REFERENCES, (darks, flats), strict=True) if images is not None}
     for kind, images in given.items():

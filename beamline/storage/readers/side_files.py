@@ -1,8 +1,8 @@
-"""Settings files that CT scanners write next to their images: distances, pixel size, angles and white level.
+"""Reads the settings files that CT scanners write next to their images: distances, pixel size, angles and white level.
 
 Nikon's .xtekct, SkyScan's .log, GE phoenix's .pca, ScanParameter.xml of YXLON, the .xml of Diondo and
-the "data settings XRE.txt" of TESCAN (FleXray), by the keys that public readers use (TIGRE, CIL). A value whose key is
-missing is not guessed.
+the "data settings XRE.txt" of TESCAN (FleXray), by the keys that public readers use (TIGRE, CIL). If a key is missing,
+its value is not guessed.
 """
 
 from __future__ import annotations
@@ -26,21 +26,22 @@ from beamline.core.text import NUMBER, with_points
 from beamline.storage.readers.base import NotUsed, ScanSource
 from beamline.storage.readers.frames import Frames
 
-_MOST = 20  # files next to a scan that are looked at
+_MOST = 20  # largest number of files next to a scan that are examined
 
 
 @dataclass(frozen=True)
 class MakerKeys:
-    """Keys of a vendor's file, as "section/key" in lower case; "" for what it does not state.
+    """Keys in a vendor's file, as "section/key" in lower case; "" for a value that the file does not contain.
 
     Attributes:
-        sod, sdd: distances from the source to the axis and to the detector, mm.
-        pixel: width of a pixel in mm, times `unit`; at the sample if `at_sample`.
+        sod, sdd: distances in mm from the source to the rotation axis and to the detector.
+        pixel: width of a pixel; its value times `unit` is in mm. It is measured at the sample if `at_sample` is True,
+            otherwise on the detector.
         count: of the projections.
-        step, span: degrees between two projections, or of all.
-        first, last: degrees of the first projection, and of the last.
+        step, span: angle in degrees between two projections, and of the whole scan.
+        first, last: angles in degrees of the first and of the last projection.
         white: counts of the open beam.
-        scale: a factor of both distances.
+        scale: factor on both distances.
         helix: keys that are "true" if the source moves on another path than a circle.
     """
 
@@ -91,18 +92,17 @@ MAKERS = (
         first=f"{_XRE}start angle", last=f"{_XRE}last angle",
     ),
 )  # fmt: skip
-_ROUND = {"Diondo": 360.0}  # degrees of the scans of a maker whose file states none
+_ROUND = {"Diondo": 360.0}  # total angle in degrees, for a maker whose files do not state it
 
 
 @dataclass(frozen=True, eq=False)
 class SideFile:
-    """The geometry of a scan stated by a vendor's file; None for what it does not state.
+    """The geometry of a scan according to a vendor's file; None for values that the file does not state.
 
     Attributes:
         cone: mm from the source to the rotation axis and to the detector.
         pixel_mm: width of a pixel on the detector.
-        count: of the projections.
-        angles: float64 [projection] radians.
+        count: number of projections. angles: float64 [projection] radians.
         white: counts of the open beam.
     """
 
@@ -116,7 +116,7 @@ class SideFile:
 
     @property
     def option(self) -> str:
-        """The option that takes the file, for a command line."""
+        """The command line option that selects this file."""
         return f'--scanner-file "{self.path}"' if " " in str(self.path) else f"--scanner-file {self.path}"
 
     def __str__(self) -> str:
@@ -131,8 +131,8 @@ class SideFile:
 
 
 def with_side_file(base: ScanSource, side: SideFile) -> ScanSource:
-    """A scan with the distances and the pixel size of a vendor's file; DataError if that has another number of
-    projections.
+    """A scan with the distances and the pixel size of a vendor's file. Raises DataError if the file states another
+    number of projections.
     """
     views = base.table.views.size
     if views != side.count:
@@ -151,7 +151,7 @@ def read_side_file(path: Path) -> SideFile:
     """Read a vendor's file.
 
     Raises:
-        DataError: the file is of no known vendor, or a distance, the pixel size or the number of projections is
+        DataError: the file is not of a known vendor, or a distance, the pixel size or the number of projections is
             missing.
     """
     try:
@@ -167,29 +167,30 @@ def read_side_file(path: Path) -> SideFile:
 
 
 def side_of(source: ScanSource) -> SideFile | None:
-    """The vendor's file in a folder of images, or next to it or to a TIFF, if exactly one has the same number of
-    projections.
+    """The vendor's file in a folder of images, next to the folder, or next to a TIFF. None unless exactly one file
+    states the same number of projections.
     """
     if not source.side_files:
         return None
-    views, found = source.table.views.size, []
+    views, sides = source.table.views.size, []
     for path in _candidates(source.path):
-        with suppress(Exception):  # what is only looked at, for an offer, stops no scan, whatever it holds
-            found.append(read_side_file(path))
-    found = [side for side in found if side.count == views]
-    return found[0] if len(found) == 1 else None
+        # these files are only read to make a suggestion, so no content of theirs may raise an error
+        with suppress(Exception):
+            sides.append(read_side_file(path))
+    sides = [side for side in sides if side.count == views]
+    return sides[0] if len(sides) == 1 else None
 
 
 def reconstructed_pixel_mm(log: Path) -> float | None:
-    """Edge of a voxel in mm by the log that NRecon writes next to its slices; None if it states none."""
-    with suppress(Exception):  # whatever the log of another program holds
+    """Voxel size in mm from the log that NRecon writes next to its slices; None if the log does not state it."""
+    with suppress(Exception):  # the log of another program may contain anything
         edge = float(with_points([_values(log)["reconstruction/pixel size (um)"]])[0]) * 1e-3
         return edge if 0 < edge < _LARGEST else None
     return None
 
 
 def offered(source: ScanSource) -> tuple[NotUsed, ...]:
-    """A sentence on the contents of a vendor's file next to these images."""
+    """A sentence that says what a vendor's file next to these images contains."""
     side = side_of(source)
     return () if side is None else (NotUsed(side.path.name, str(side), f"{side.option} uses it", True),)
 
@@ -204,7 +205,7 @@ def _candidates(scan: Path) -> Iterator[Path]:
 
 
 def _values(path: Path) -> dict[str, str]:
-    """Texts by "section/key" in small letters, of an INI, JSON or XML file."""
+    """The values in an INI, JSON or XML file, as text, by "section/key" in lower case."""
     text, values = _text(path), dict[str, str]()
     if path.suffix.lower() == ".xml":
         if "<!DOCTYPE" in text or "<!ENTITY" in text:
@@ -214,8 +215,9 @@ def _values(path: Path) -> dict[str, str]:
         _of_json(json.loads(text), "", values)
     else:
         parser = configparser.RawConfigParser(strict=False, allow_no_value=True, delimiters=("=",))
-        lines = "\n".join(map(str.strip, text.splitlines()))  # indented ones continue none
-        parser.read_string(lines.replace("\n# projections", "\nprojections"))  # a key of TESCAN's, no comment
+        lines = "\n".join(map(str.strip, text.splitlines()))  # an indented line does not continue the line before
+        # TESCAN's files have a key that begins like a comment
+        parser.read_string(lines.replace("\n# projections", "\nprojections"))
         values = {
             f"{section}/{key}".lower(): (value or "").strip('"')
             for section in parser
@@ -225,7 +227,9 @@ def _values(path: Path) -> dict[str, str]:
 
 
 def _text(path: Path) -> str:
-    """The content of a small file; numbers and keys are also read if a Windows program wrote its own characters."""
+    """The content of a small file. Characters of a Windows code page do not matter, because numbers and keys are
+    ASCII.
+    """
     require_regular(path, SETTINGS)
     return decoded(path.read_bytes(), "replace")
 
@@ -246,7 +250,9 @@ def _of_json(item: Any, path: str, values: dict[str, str]) -> None:
 
 
 def _numbers(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> dict[str, float | None]:
-    """The number at the beginning of the text of each key, by the names in MakerKeys; None for a text without one."""
+    """The number at the beginning of the text of each key, by the names in MakerKeys; None if the text does not begin
+    with a number.
+    """
     names = ("sod", "sdd", "pixel", "count", "step", "span", "first", "last", "white", "scale")
     texts = [values.get(getattr(keys, name), "") for name in names]
     try:
@@ -257,7 +263,7 @@ def _numbers(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> dict[str
 
 
 _NEEDED = "sod", "sdd", "pixel", "count"
-_LARGEST = 1e7  # of these numbers: no scan has as many projections, and no distance is as long in mm
+_LARGEST = 1e7  # largest number accepted: no scan has as many projections, and no distance is as long in mm
 
 
 def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFile:
@@ -275,7 +281,9 @@ def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFi
 
 
 def _degrees(path: Path, keys: MakerKeys, number: Mapping[str, float | None], n: int) -> NDArray[np.float64] | None:
-    """Degrees of each projection: as listed next to the file, or in equal steps; None if nothing is stated."""
+    """The angle of each projection in degrees: as listed in a file next to it, or in equal steps. None if neither is
+    stated.
+    """
     if keys.maker == "Nikon" and (listed := _listed_angles(path, n)) is not None:
         return listed
     step, span = number["step"], number["span"] or _ROUND.get(keys.maker)
@@ -287,7 +295,9 @@ def _degrees(path: Path, keys: MakerKeys, number: Mapping[str, float | None], n:
 
 
 def _listed_angles(path: Path, n: int) -> NDArray[np.float64] | None:
-    """Degrees of each projection in `_ctdata.txt` beside Nikon's file; None if it is missing, or of another scan."""
+    """The angle of each projection in degrees, from `_ctdata.txt` next to Nikon's file. None if that file is missing or
+    belongs to another scan.
+    """
     files = sorted(path.parent.glob("*_ctdata.txt"))
     if len(files) != 1:
         return None

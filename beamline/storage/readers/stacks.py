@@ -1,4 +1,4 @@
-"""StacksSource: a scan with one stack of projections and others of darks and flats, such as HDF5 datasets of any
+"""StacksSource: a scan with a stack of projections and separate stacks of darks and flats, such as HDF5 datasets of any
 name.
 
 Such a layout does not state when darks and flats were taken: the frames are numbered with darks first, then flats, then
@@ -63,15 +63,15 @@ class StacksSource(ScanSource):
     Quantity: "counts" if there are darks and flats, otherwise "unknown".
 
     Attributes:
-        rows: int64 [frame, 2], the stack of each frame and its place there.
+        rows: int64 [frame, 2], number of the stack that contains the frame, and position of the frame in the stack.
     """
 
     rows: NDArray[np.int64] = np.zeros((0, 2), np.int64)
 
     def __init__(self, path: Path, file: Any, stacks: Sequence[FrameStack], *, format: str, facts: Attributes) -> None:
-        """Take over an open file, or what else is closed with the scan.
+        """Read from stacks. `file` is the open file, or any other object, that is closed together with the scan.
 
-        Angles are NaN; `stacks` are in the order of the frames, the projections last.
+        Angles are NaN. `stacks` are in the order of the frames, with the projections last.
         """
         self.path, self.format, self.facts = path, format, facts
         self._file, self._stacks = file, stacks
@@ -84,8 +84,8 @@ class StacksSource(ScanSource):
         self.in_order = kinds == {FrameKind.PROJECTION}
 
     def number_frames(self, sizes: Sequence[int]) -> None:
-        """Number the frames of stacks of these sizes, new ones after those known so far; angles and exposures become
-        NaN.
+        """Number the frames of stacks with these sizes. New frames come after the frames known so far. Angles and
+        exposures become NaN.
         """
         had = np.bincount(self.rows[:, 0], minlength=len(sizes))
         new = [(stack, place) for stack, n in enumerate(sizes) for place in range(had[stack], n)]
@@ -144,17 +144,17 @@ class StacksSource(ScanSource):
 def open_stacks(
     path: Path, data: str | None, darks: str | None = None, flats: str | None = None, angles: str | None = None
 ) -> StacksSource:
-    """The scan whose arrays have these paths in an HDF5 file, a Zarr or an .npy. A dark or flat may be a single
+    """Open the scan whose arrays have these paths in an HDF5 file, a Zarr or an .npy. A dark or flat may be a single
     image [row, col].
 
     Args:
-        data: of the projections, None: the only array of images. Their dimensions may follow it, as in
-            `/images:view,col,row`, and those of darks and flats are in the same order.
-        angles: of the angles of the projections alone, whose number helps to tell which dimension is that of the
+        data: path of the projections; None: the only array of images. The order of the dimensions may follow the path,
+            as in `/images:view,col,row`. Darks and flats have the same order.
+        angles: path of the angles of the projections. Their number helps to decide which dimension counts the
             projections.
 
     Raises:
-        DataError: an array does not exist, or is not a stack of frames; the message lists the datasets of the file.
+        DataError: an array does not exist or is not a stack of frames. The message lists the datasets in the file.
     """
     file = open_array_file(path)
     with hdf5.closed_on_error(file):
@@ -181,7 +181,9 @@ def open_stacks(
 
 
 def _take_angles(source: StacksSource, lists: list[NamedArray]) -> None:
-    """Use the one list with a name for angles, in the unit that it states, or in which it covers 180 or 360 degrees."""
+    """Use the only list whose name means angles. Its unit is the one that it states, or the unit with which it covers
+    180 or 360 degrees.
+    """
     if len(lists) != 1:
         return
     item, values, turns = lists[0], np.unique(lists[0][...]), {"rad": 2 * np.pi, "deg": 360.0}
@@ -195,11 +197,11 @@ _ANGLES = re.compile("angle|theta", re.IGNORECASE)
 
 
 def _take_geometry(source: StacksSource, views: Any) -> None:
-    """Take the geometry that CIL states beside `views`, the dataset of the projections; lengths in mm.
+    """Use the geometry that CIL stores next to `views`, the dataset of the projections. Lengths are in mm.
 
-    CIL turns the object by its angles counter-clockwise about the axis, which is the beam turned by their negative (its
-    `convert_geometry_to_astra_vec_3D`). Here the projection turns by θ in the frame of the detector: columns, beam,
-    rows.
+    In CIL, the angles rotate the object counter-clockwise about the axis, which is the same as a rotation of the beam
+    by the negative angles (CIL's `convert_geometry_to_astra_vec_3D`). Here a projection is rotated by θ in the frame of
+    the detector: columns, beam, rows.
     """
     config = datasets.resolve(views.parent.parent, "config") if isinstance(views, h5py.Dataset) else None
     if not isinstance(config, h5py.Group) or "pixel_size_h" not in views.attrs:
@@ -214,7 +216,7 @@ def _take_geometry(source: StacksSource, views: Any) -> None:
         start, normal = _vector(config, "source/position", (0, 0, 0)), np.cross(across, up)
         normal *= np.sign(normal @ beam)
         source.cone = float(normal @ (axis - start)), float(normal @ (end - start))
-        foot = start + source.cone[1] * normal  # of the central ray
+        foot = start + source.cone[1] * normal  # pixel that the central ray meets
         source.central_ray = tuple((middle + plane @ (foot - end) / pitch).tolist())
         axis = start + (axis - start) * source.cone[1] / source.cone[0]
     source.axis_col = float((middle + plane @ (axis - end) / pitch)[1])
@@ -224,12 +226,12 @@ def _take_geometry(source: StacksSource, views: Any) -> None:
 
 
 def in_frame_of_detector(item: Any, angles: F64, unit: str | None) -> F64:
-    """Angles of projections in radians, relative to the detector. CIL states the angles of its object, which are
-    converted; other angles are returned unchanged.
+    """Angles of projections in radians, relative to the detector. CIL states the angles of the object; they are
+    converted. All other angles are returned unchanged.
 
     Args:
         angles: the values of `item` in radians.
-        unit: unit of the angles, if the caller states another unit than the file.
+        unit: unit of the angles that the caller states instead of the file.
     """
     config = item.parent if isinstance(item, h5py.Dataset) else None
     if config is None or datasets.dataset(config, "detector/direction_x") is None:
@@ -237,11 +239,11 @@ def in_frame_of_detector(item: Any, angles: F64, unit: str | None) -> F64:
     across, up, beam = _frame(config)
     sense = -np.sign(np.linalg.det([across, beam, up]) * (_vector(config, "rotation_axis/direction", (0, 0, 1)) @ up))
     factor = datasets.factor_of(unit or datasets.attribute(item, "angle_unit"), datasets.ANGLE_UNITS) or 0.0
-    return np.asarray(sense * (angles + float(item.attrs.get("initial_angle", 0)) * factor)) + 0.0  # no -0
+    return np.asarray(sense * (angles + float(item.attrs.get("initial_angle", 0)) * factor)) + 0.0  # avoids -0
 
 
 def _frame(config: h5py.Group) -> tuple[F64, F64, F64]:
-    """The directions (x, y, z) in which column and row numbers rise, and that of the beam."""
+    """The directions (x, y, z) in which column numbers and row numbers increase, and the direction of the beam."""
     origin = datasets.attribute(datasets.resolve(config.parent, "data/data") or config, "panel_origin")
     across = _vector(config, "detector/direction_x", (1, 0, 0)) * (-1 if "right" in origin else 1)
     up = _vector(config, "detector/direction_y", (0, 0, 1)) * (-1 if "top" in origin else 1)
@@ -252,14 +254,16 @@ def _frame(config: h5py.Group) -> tuple[F64, F64, F64]:
 
 
 def _vector(config: h5py.Group, where: str, default: tuple[float, ...]) -> F64:
-    """A vector (x, y, z) of the geometry; where only two are stated, z is 0."""
+    """A vector (x, y, z) of the geometry. If only two components are stated, z is 0."""
     item = datasets.dataset(config, where)
     values = np.ravel(default if item is None else datasets.values_of(item)).astype(np.float64)
     return np.pad(values[:3], (0, 3 - min(values.size, 3)))
 
 
 def _only_images(file: ArrayFile) -> str:
-    """The name of the one array that may be images. DataError: there are several, or none."""
+    """The name of the only array that may contain images. Raises DataError if there are several such arrays, or
+    none.
+    """
     images = [name for name, item in file.items() if item.ndim > 1]
     if len(images) != 1:
         raise DataError(
@@ -270,7 +274,7 @@ def _only_images(file: ArrayFile) -> str:
 
 
 def _named_order(file: Any, data: str) -> tuple[Any, str, Order | None]:
-    """The dataset of the projections, its path, and which of its dimensions are frames, rows and columns, if stated."""
+    """The dataset of the projections, its path, and the order of its dimensions (frames, rows, columns) if stated."""
     where, colon, names = data.rpartition(":")
     if colon and datasets.dataset(file, data) is None:
         return dataset_at(file, where), where, stated_order(names)
@@ -279,7 +283,7 @@ def _named_order(file: Any, data: str) -> tuple[Any, str, Order | None]:
 
 
 def dataset_at(file: Any, where: str) -> Any:
-    """The array at a path. If there is none, the DataError lists those of the file."""
+    """The array at a path. If there is no array, the DataError lists the arrays of the file."""
     item = datasets.dataset(file, where)
     if item is None:
         datasets.refuse_broken(file, where)
@@ -288,14 +292,14 @@ def dataset_at(file: Any, where: str) -> Any:
 
 
 def datasets_text(file: Any) -> str:
-    """A sentence on the datasets of a file and their shapes, the largest first."""
+    """A sentence that lists the datasets of a file with their shapes, the largest first."""
     arrays = sorted(arrays_of(file), key=lambda item: (-item.ndim, -item.size))
     shapes = [f"{item.name} ({' x '.join(map(str, item.shape))})" for item in arrays[:_LISTED]]
     more = f" and {len(arrays) - _LISTED} more" if len(arrays) > _LISTED else ""
     return f"It has {', '.join(shapes)}{more}." if shapes else "It has no arrays."
 
 
-_LISTED = 10  # datasets of a file that an error names
+_LISTED = 10  # most datasets that an error names
 
 
 def arrays_of(file: Any) -> list[Any]:
@@ -317,8 +321,8 @@ def _recognises(path: Path, opening: Opening) -> bool:
         return isinstance(data, h5py.Dataset) and datasets.attribute(data, "data_type") == "AcquisitionData"
 
 
-def _at(path: Path, arrays: NamedArrays) -> StacksSource:
+def _scan_of_arrays(path: Path, arrays: NamedArrays) -> StacksSource:
     return open_stacks(path, arrays.data, arrays.darks, arrays.flats, arrays.angles)
 
 
-FORMAT = ScanFormat("a scan of CIL", _recognises, lambda path, opening: open_stacks(path, _CIL), _at)
+FORMAT = ScanFormat("a scan of CIL", _recognises, lambda path, opening: open_stacks(path, _CIL), _scan_of_arrays)

@@ -25,18 +25,20 @@ from beamline.storage.structure import PACKED, is_blank
 
 _MOST_PAGES = 100_000
 SUFFIXES = (".tif", ".tiff")
-VOLUME = "splatline volume"  # Value of `format` in the facts of a file that is a volume of ours, not a scan
+VOLUME = "splatline volume"  # Value of `format` in the facts of a file that is not a scan but a volume of this program
 UNREADABLE = (*ALTERED, ImportError, lzma.LZMAError, tifffile.TiffFileError, Image.DecompressionBombError)
-"""What tifffile, zipfile, Pillow and their decoders raise for a file that they cannot read; none of ours is among
-them."""
+"""Errors that tifffile, zipfile, Pillow and their decoders raise for an unreadable file. Errors of this program are not
+among them.
+"""
 OTHER_FILES = "images of an OME set in other files"
-_NO_IMAGE = 1 | 4  # bits of NewSubfileType: an image of reduced resolution, a mask
-logging.getLogger("tifffile").addHandler(logging.NullHandler())  # else what it logs goes to stderr, beside our sentence
+_NO_IMAGE = 1 | 4  # bits of NewSubfileType: an image with reduced resolution, and a mask
+# otherwise the messages of tifffile appear on stderr next to ours
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 
 class Complaints(logging.Handler):
-    """Collects tifffile's messages on a damaged file: tifffile only logs them, and continues with the pages that it
-    finds.
+    """Collects tifffile's messages on a damaged file: tifffile only logs such messages, and continues with the pages
+    that it finds.
     """
 
     def __init__(self) -> None:
@@ -55,35 +57,40 @@ class Complaints(logging.Handler):
 
 
 def is_hidden(name: str) -> bool:
-    """True if a file is not an image but a companion that the operating system made, such as `._0001.tif` of a Mac."""
+    """True if a file is not an image, but was created by the operating system, such as `._0001.tif` on a Mac."""
     return name.rpartition("/")[2].startswith(".")
 
 
 def open_tiff(file: Path | IO[bytes]) -> tifffile.TiffFile:
-    """A TIFF and the pages in it. If it is one file of a set, its metadata list the pages of all files."""
+    """A TIFF and its pages. If it is one file of a set, its metadata list the pages of all files."""
     if isinstance(file, Path):
         require_regular(file)
     return tifffile.TiffFile(file, is_ome=False, is_mmstack=False, is_ndtiff=False)
 
 
 def images_of(tif: tifffile.TiffFile) -> list[tifffile.TiffPageSeries]:
-    """Groups of pages of one shape and type, without copies of reduced resolution, masks, and thumbnails.
+    """The groups of pages with the same shape and type. Copies with reduced resolution, masks and thumbnails are left
+    out.
 
-    Pages that tifffile wrote are used as pages, whether they were written together or appended, unless the file states
-    that only its first page has a header.
+    In a TIFF written by tifffile, all pages are used, whether they were written together or appended, unless the file
+    states that only its first page has a header.
     """
     tif.is_shaped = tif.is_shaped and '"truncated": true' in tif.pages.first.description
     return [part for part in tif.series if not part.keyframe.subfiletype & _NO_IMAGE] or [*tif.series]
 
 
 def orientation(tif: tifffile.TiffFile) -> int:
-    """Which sides of an image its first row and column are: 1 to 8, as in tag 274 of TIFF 6.0."""
+    """The orientation of an image: which sides the first row and the first column are, as a number from 1 to 8 (tag 274
+    of TIFF 6.0).
+    """
     tag = images_of(tif)[0].keyframe.tags.get(274)
     return int(tag.value) if tag is not None and tag.value in range(1, 9) else 1
 
 
 def is_untyped(tif: tifffile.TiffFile) -> bool:
-    """True if a TIFF does not say of what type its pixels are: no SampleFormat (tag 339), or 4, undefined."""
+    """True if a TIFF does not state the type of its pixels: it has no SampleFormat (tag 339), or the value 4
+    (undefined).
+    """
     tag = images_of(tif)[0].keyframe.tags.get(339)
     return tag is None or int(np.ravel(tag.value)[0]) not in (1, 2, 3)
 
@@ -96,10 +103,10 @@ def upright(images: NDArray[Any], orientation: int) -> NDArray[Any]:
 
 
 def stated(path: Path, tif: tifffile.TiffFile) -> tuple[NotUsed, ...]:
-    """The images of a TIFF that are not used: copies, and those of other files.
+    """The images of a TIFF that are not used: copies, and images in other files.
 
     Raises:
-        DataError: its OME metadata state several axes, and it is not known which of them is that of the projections.
+        DataError: the OME metadata state several axes, and it is unclear which of them counts the projections.
     """
     listed, why = 0, "the full-resolution images of this file are used as frames"
     for pixels in re.findall(r"<Pixels\b[^>]*>", tif.pages.first.description):
@@ -117,8 +124,8 @@ def stated(path: Path, tif: tifffile.TiffFile) -> tuple[NotUsed, ...]:
 
 
 def read_image(file: Path | IO[bytes], most: float = math.inf) -> NDArray[Any]:
-    """Read all pages of a TIFF; [row, col] for one page. Raises ValueError if it claims more bytes than allowed, or
-    than it can contain.
+    """Read all pages of a TIFF; [row, col] for one page. Raises ValueError if the header states more bytes than are
+    allowed, or more than the file can contain.
     """
     with open_tiff(file) as tif:
         refuse_packed(tif)
@@ -142,20 +149,26 @@ DECODERS: dict[str, Callable[..., NDArray[Any]]] = {
     ".npy": lambda file, most=0: np.load(file, allow_pickle=False),
     ".png": _of_png,
 }
-"""How the images of a folder are read, by suffix: each takes an open file, and the bytes that it may unpack to."""
-FOREIGN = ".jpg", ".jpeg", ".bmp", ".gif", ".jp2"  # pictures that are not read: nearly all have 8 bits, or losses
+"""Functions that read the images of a folder, by suffix. Their arguments are an open file, and the largest number of
+bytes of the decompressed image.
+"""
+# formats of pictures that are not read, because nearly all of them have 8 bits or lossy compression
+FOREIGN = ".jpg", ".jpeg", ".bmp", ".gif", ".jp2"
 
 
 def images_among(names: Sequence[str]) -> list[str]:
-    """The images among files, of the first kind that there is: files of other kinds next to them are not frames of the
-    scan."""
+    """The images among files. Only the first kind in `DECODERS` that occurs is used; files of other kinds are not
+    frames of the scan.
+    """
     kinds = (SUFFIXES, (".npy",), (".png",))
     by_kind = ([name for name in names if name.lower().endswith(kind) and not is_hidden(name)] for kind in kinds)
     return next(filter(None, by_kind), [])
 
 
 def no_image(path: Path, names: Sequence[str]) -> str:
-    """A sentence on a folder without images that can be read, or on a picture of a kind that is not read."""
+    """A sentence that says that a folder contains no readable images, or that a picture has a format that is not
+    read.
+    """
     foreign = next((name for name in names if name.lower().endswith(FOREIGN)), None)
     if foreign is None:
         return f"{path} contains no image: no .tif, .tiff, .npy or .png file."
@@ -181,9 +194,10 @@ def image_of(tif: tifffile.TiffFile) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 
 def require_possible(tif: tifffile.TiffFile, most: float = math.inf) -> None:
-    """Raise ValueError for more pages than any scan has, or for more bytes than allowed, or than the file can contain.
+    """Raise ValueError if a TIFF has more pages than any scan, or states more bytes than are allowed or than the file
+    can contain.
 
-    Pages are grouped without reading each one, because tifffile needs minutes for a million pages.
+    The pages are grouped without reading each of them, because tifffile would need minutes for a million pages.
     """
     with suppress(IndexError):
         tif.pages.get(_MOST_PAGES)
@@ -195,7 +209,7 @@ def require_possible(tif: tifffile.TiffFile, most: float = math.inf) -> None:
 
 
 def refuse_packed(tif: tifffile.TiffFile) -> None:
-    """Raise ValueError for packed pixels of 10, 12 or 14 bits if no codec unpacks them."""
+    """Raise ValueError for packed pixels of 10, 12 or 14 bits if no codec for them is installed."""
     bits = tif.pages.first.bitspersample
     if bits > 8 and bits not in (16, 32, 64) and find_spec("imagecodecs") is None:
         raise ValueError(

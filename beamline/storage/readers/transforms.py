@@ -1,5 +1,5 @@
-"""Scans that are read differently from how they are stored: some columns only, other kinds or pixel types, or the
-frames of several files.
+"""Scans that are read in another form than they are stored: only some columns, other kinds of frames or pixel types, or
+the frames of several files.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from beamline.storage.readers.base import WHOLE, ScanSource, TakesTooLongError, 
 from beamline.storage.readers.frames import Frames, Read
 from drivers.base.frame import FrameKind
 
-UNPACKED, _READ = 2**28, 2**30  # bytes of a frame in a file, and of those read at once, to describe a scan
+UNPACKED, _READ = 2**28, 2**30  # most bytes of one frame, and of all frames, that are read to describe a scan
 
 
 def brief_source(base: ScanSource, over: Callable[[], bool]) -> ScanSource:
-    """The scan for callers that only describe it: raises TakesTooLongError if `over` returns True before a read, or if
-    a read would need much time or memory.
+    """The scan for callers that only describe it. A read raises TakesTooLongError if `over` returns True before it, or
+    if it would need much time or memory.
 
-    The order of dimensions or the chunks of a file can make reading any frame as expensive as reading all.
+    With some orders of dimensions, or some chunks, reading one frame takes as long as reading all frames.
     """
 
     def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:
@@ -42,11 +42,11 @@ def brief_source(base: ScanSource, over: Callable[[], bool]) -> ScanSource:
 
 
 def cropped(base: ScanSource, cols: tuple[int, int]) -> ScanSource:
-    """Columns `cols` of a scan, the last not included; column numbers, such as the axis and regions of flags, count
-    from the first of them.
+    """The scan with only the columns (first, end) `cols`; `end` is not included. Column numbers, such as the axis and
+    the regions of flags, are counted from the first of these columns.
 
     Raises:
-        ConfigError: they do not lie in the detector.
+        ConfigError: columns lie outside the detector.
     """
     first, end = cols
     if not 0 <= first < end <= base.shape[1]:
@@ -55,7 +55,7 @@ def cropped(base: ScanSource, cols: tuple[int, int]) -> ScanSource:
     def moved(table: FrameTable) -> FrameTable:
         if (flags := table.flags) is None:
             return table
-        there = flags.regions[..., :1] >= 0  # below 0: no region
+        there = flags.regions[..., :1] >= 0  # a value below 0 means no region
         regions = flags.regions - np.where(there, [0, 0, first, first], 0).astype(np.int32)
         return replace(table, flags=replace(flags, regions=regions))
 
@@ -82,7 +82,7 @@ def turned(base: ScanSource) -> ScanSource:
     The last column becomes the first row. Reading any rows requires reading whole frames.
 
     Raises:
-        DataError: a scan with flags, which has a vertical axis.
+        DataError: the scan has flags of the monitor, so its axis is vertical.
     """
     if base.table.flags is not None:
         raise DataError(f"Omit --horizontal-axis: {base.path} is a scan with a vertical rotation axis.")
@@ -103,15 +103,16 @@ def turned(base: ScanSource) -> ScanSource:
 
 
 def with_kinds(base: ScanSource, kinds: str) -> ScanSource:
-    """A scan whose kinds of frames the caller states, or which has only the frames of one energy.
+    """A scan with the kinds of frames that the caller states, or with only the frames of one energy.
 
     Args:
-        kinds: such as "darks=0:5,flats=5:10+95:100,views=10:95", rows of the scan, ends not included. Without "views"
-            all other frames are projections, with it they are invalid. "none=30:38" alone makes these invalid, and the
-            others keep their kind. "energy=20" makes frames of other energies invalid, according to the file.
+        kinds: rows of the scan by kind, such as "darks=0:5,flats=5:10+95:100,views=10:95"; ends are not included. All
+            other frames are projections, or invalid if "views" is given. "none=30:38" alone makes these frames invalid,
+            and all others keep their kinds. "energy=20" makes all frames invalid that have another energy according to
+            the file.
 
     Raises:
-        DataError: the text is wrong, rows are outside the scan, or the file states no such energy.
+        DataError: the text is wrong, rows lie outside the scan, or the file does not state this energy.
     """
     words, own = [word.strip() for word in kinds.split(",")], dict[str, Any]()
     named = [word for word in words if not word.startswith(_ENERGY)]
@@ -126,7 +127,9 @@ def with_kinds(base: ScanSource, kinds: str) -> ScanSource:
 
 
 def kinds_and_views(frames: str | None) -> tuple[str | None, slice | None]:
-    """The kinds and the projections that --frames names, as "darks=0:5,flats=5:10,0::2" does; None: it names none."""
+    """The kinds and the selected projections in the text of --frames, such as "darks=0:5,flats=5:10,0::2". None for the
+    part that is missing.
+    """
     words = [] if frames is None else frames.split(",")
     matches = [_VIEWS.fullmatch(word) for word in words]
     taken = [slice(*(int(number) if number else None for number in match.groups())) for match in matches if match]
@@ -136,13 +139,14 @@ def kinds_and_views(frames: str | None) -> tuple[str | None, slice | None]:
 
 
 def selected(base: ScanSource, views: slice) -> ScanSource:
-    """Some projections of a scan, counted from 0 without darks and flats; the others are invalid frames.
+    """A scan with only some of its projections, which are counted from 0 without darks and flats. All other projections
+    become invalid frames.
 
-    If the number of darks (flats) is a multiple of the step, they were taken in turn like the projections, so those of
-    the same turn are selected, also counted from 0. Otherwise all of them are used.
+    If the number of darks (or flats) is a multiple of the step, they were taken alternately like the projections. Then
+    the darks (or flats) with the same positions are selected, also counted from 0. Otherwise all of them are used.
 
     Raises:
-        DataError: no projection is left.
+        DataError: no projection is selected.
     """
     table, n, out = base.table, base.table.views.size, list[NDArray[np.int64]]()
     first, end, step = views.indices(n)
@@ -158,7 +162,7 @@ def selected(base: ScanSource, views: slice) -> ScanSource:
 
 
 def only_omits(kinds: str | None) -> bool:
-    """True if the caller states no kinds of frames, only that some are left out."""
+    """True if the caller only leaves out frames and does not state their kinds."""
     return kinds is not None and all(word.strip().startswith(("none=", _ENERGY)) for word in kinds.split(","))
 
 
@@ -174,7 +178,7 @@ def _stated_keys(kinds: str, known: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def _of_one_energy(source: ScanSource, word: str) -> tuple[float, NDArray[np.bool_]]:
-    """keV of "energy=20", and the frames of other energies."""
+    """The energy in keV of a text such as "energy=20", and the frames with other energies."""
     try:
         kev = float(word.removeprefix(_ENERGY))
     except ValueError:
@@ -189,7 +193,7 @@ def _of_one_energy(source: ScanSource, word: str) -> tuple[float, NDArray[np.boo
 
 
 def in_words(energies: NDArray[np.float64]) -> str:
-    """How many frames have which energy, such as "45 at 20 keV and 45 at 30 keV"."""
+    """Text with the number of frames at each energy, such as "45 at 20 keV and 45 at 30 keV"."""
     parts = frames_by_energy(energies)
     listed = [f"{n} at {kev:.6g} keV" for kev, n in parts[:_LISTED]]
     listed += [f"and more up to {parts[-1][0]:.6g} keV"] if len(parts) > _LISTED else []
@@ -197,21 +201,23 @@ def in_words(energies: NDArray[np.float64]) -> str:
 
 
 def frames_by_energy(energies: NDArray[np.float64]) -> list[tuple[float, int]]:
-    """(keV, number of frames) of each energy; energies within a part in ten thousand are the same."""
+    """(keV, number of frames) for each energy. Energies that differ by less than a part in ten thousand count as the
+    same.
+    """
     known = np.sort(energies[np.isfinite(energies)])
     parts = np.split(known, np.flatnonzero(np.diff(known) > _SAME_ENERGY * known[:-1]) + 1)
     return [(float(np.median(part)), int(part.size)) for part in parts if part.size]
 
 
 _ENERGY = "energy="
-_SAME_ENERGY = 1e-4  # as a monochromator repeats one
-_LISTED = 6  # energies in a sentence
-_VIEWS = re.compile(r"\s*(-?\d{1,9})?:(-?\d{1,9})?(?::([1-9]\d{0,8})?)?\s*")  # a slice of Python
+_SAME_ENERGY = 1e-4  # reproducibility of a monochromator
+_LISTED = 6  # most energies that a sentence lists
+_VIEWS = re.compile(r"\s*(-?\d{1,9})?:(-?\d{1,9})?(?::([1-9]\d{0,8})?)?\s*")  # a slice as in Python
 _KINDS = {"darks": FrameKind.DARK, "flats": FrameKind.FLAT, "views": FrameKind.PROJECTION, "none": FrameKind.INVALID}
 
 
 def _ranges(kinds: str, n: int) -> list[tuple[FrameKind, int, int]]:
-    """Kind and rows [first, end) of each range in `kinds`; DataError for what is none."""
+    """Kind and rows [first, end) of each range in `kinds`. Raises DataError for a text that is not a range."""
     ranges = []
     for word in kinds.split(","):
         name, _, places = word.strip().partition("=")
@@ -230,8 +236,8 @@ def _ranges(kinds: str, n: int) -> list[tuple[FrameKind, int, int]]:
 
 
 def as_unsigned(base: ScanSource, dtype: np.dtype[Any]) -> ScanSource:
-    """A scan whose pixels are read as their true type: unsigned counts that were stored as signed ones, or reals that
-    were stored as whole numbers.
+    """A scan whose pixels are read as their true type: unsigned counts that were stored as signed integers, or real
+    numbers that were stored as integers.
     """
     wrapped = f"int{8 * dtype.itemsize} that overflowed"
     what = "real numbers, judging by their bits, because the TIFF has no SampleFormat" if dtype.kind == "f" else wrapped
@@ -252,7 +258,7 @@ def unsigned(images: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
 
 
 def real_type(images: NDArray[Any]) -> np.dtype[Any] | None:
-    """The real type of integers [..., col] that are the bits of real numbers; None if they are integers.
+    """The floating-point type, if integers [..., col] are in fact the bits of real numbers. None if they are integers.
 
     Real numbers of one quantity are close together in their bits. Integers look like this only if nearly all of them
     are within four per cent of the range of their type, around a quarter or three quarters of the range.
@@ -270,19 +276,19 @@ def real_type(images: NDArray[Any]) -> np.dtype[Any] | None:
     return dtype if real else None
 
 
-_OCTAVES = 2.0**20  # a quantity of an image spans less, and its median in any unit lies within its square from 1
-_NEARLY_ALL = 0.99  # of the pixels that are not 0: a few are defective
+_OCTAVES = 2.0**20  # the values of an image span a smaller range than this, whatever their unit is
+_NEARLY_ALL = 0.99  # share of the nonzero pixels; a few may be defective
 
 
 def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
-    """The unsigned type for signed integers [..., col] in which the sign bit belongs to the count; None if they are
+    """The unsigned type, if signed integers [..., col] are in fact unsigned counts that overflowed. None if they are
     signed.
 
     Images are smooth. If counts exceed the largest value of the signed type, neighbouring pixels differ by the whole
-    range of the type, but not if the pixels are read as unsigned. If all counts exceed this value, all of them look
-    negative, which is impossible for an intensity. Values that are negative because of noise around 0, or that mark
-    pixels without data by one value, have not overflowed. Four bytes may contain values of two, if a file has
-    projections as int16 next to flats as uint16.
+    range of the type. The difference disappears if the pixels are read as unsigned. If all counts exceed this value,
+    all of them look negative, which is impossible for an intensity. Negative values may also be noise around 0, or a
+    single value that marks pixels without data; these have not overflowed. A four-byte type may contain two-byte
+    values, if a file has projections as int16 and flats as uint16.
     """
     if images.dtype.kind != "i" or images.dtype.itemsize > 4 or images.shape[-1] < 2:
         return None
@@ -298,19 +304,23 @@ def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
     return dtype if plain < signed or (plain == signed and np.median(images) < 0) else None
 
 
-WRAPPED = "wrapped-numbers"  # a rule
-_END_PART, _A_ROW = 10, 0.1  # a part of the range that is near its end; edges a row from which they are no zingers
-_ALIKE = 0.05  # of the changes above an edge are below it, where both are light; behind a slit there is readout alone
-_SMOOTH = 3.0  # times the least change beside an edge: the step across the end, where one smooth image continues there
+WRAPPED = "wrapped-numbers"  # name of a rule
+_END_PART, _A_ROW = 10, 0.1  # part of the range near an end; least number of edges per row
+# Changes on the low side of an edge, as a share of those on the high side. Below this share, the low side is only
+# readout noise, as behind a slit; otherwise both sides are light.
+_ALIKE = 0.05
+_SMOOTH = 3.0  # largest step across the end of the range in a smooth image, in changes next to the edge
 
 
 def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any] | None = None) -> int:
-    """Number of edges in counts [..., col] of 16 bits from one end of the range to the other, which no optics makes.
+    """Number of edges in 16-bit counts [..., col] that go from one end of the range to the other. No optical image has
+    such edges.
 
-    Two pixels on either side must be in their half of the range, which is not so for a hot pixel or a zinger. If nearly
-    all pixels at the top of the range have the same value, they are saturated. 0 if fewer than one in ten rows has such
-    an edge. If a `flat` [..., col] is near the top on both sides, something opaque makes such an edge, unless the step
-    across the end is as smooth as its surroundings.
+    An edge counts if two pixels on either side are in the same half of the range; hot pixels and zingers are thereby
+    excluded. If nearly all pixels at the top of the range have the same value, they are saturated. The result is 0 if
+    fewer than one in ten rows has an edge. If `flat` [..., col] is near the top of the range on both sides of an edge,
+    an opaque object may have caused the edge. It then counts only if the image continues smoothly across the end of the
+    range.
     """
     if dtype.kind not in "iu" or dtype.itemsize != 2 or images.shape[-1] < 4:
         return 0
@@ -334,14 +344,15 @@ def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any]
 
 
 def in_parts(earlier: Sequence[ScanSource], last: ScanSource, path: Path | None = None) -> ScanSource:
-    """The frames of `earlier`, which are complete, and then of `last`, whose path and metadata the scan has.
+    """A scan with the frames of `earlier`, which are complete, and then the frames of `last`. Path and metadata are
+    those of `last`.
 
     Args:
         path: path of the scan, if the user stated that the files are one scan taken without a pause; None: the files
             are parts, between which beam and camera may have changed.
 
     Raises:
-        DataError: frames are of another shape or type.
+        DataError: frames have different shapes or types.
     """
     for source in earlier:
         if (source.shape, source.dtype, source.quantity) != (last.shape, last.dtype, last.quantity):

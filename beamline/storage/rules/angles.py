@@ -13,19 +13,20 @@ from recon.base.units import gone_round, look_like_degrees
 from recon.voxels.view_weights import angular_weights
 
 FARTHEST = 1e6  # degrees
-_GAP = 0.5  # degrees without a projection beyond the others, of projections in even steps
-_UNWEIGHED = 9.0  # degrees that no projection's weight covers: FBP loses a twentieth of the density
-_SAME = 0.1  # of the mean step: projections so close are one
-_EQUAL, _FEW = 1e-3, 4  # degrees between projections of one direction; columns of the detector to a direction
-_FALSE_ALARM = 1e-3  # of scans whose projections are at random
-_OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
+_GAP = 0.5  # degrees without a projection, beyond the normal spacing; for projections in equal steps
+_UNWEIGHED = 9.0  # degrees that no weight of a projection covers: FBP then loses a twentieth of the density
+_SAME = 0.1  # share of the mean step: projections that are closer count as one
+_EQUAL, _FEW = 1e-3, 4  # degrees between projections that count as one direction; detector columns per direction
+_FALSE_ALARM = 1e-3  # share of scans with random angles that may be reported
+# standard deviation of random gaps, without the largest gap, divided by their mean
+_OF_MEAN = 0.8
 _COUNTED = " The values are 0, 1, 2 and so on: are they frame numbers?"
-_LISTED = 20  # groups of frames in a sentence
-_MANY = 30  # projections: fewer within 6.28 degrees may be a trial scan, and are not refused as radians
+_LISTED = 20  # most groups of frames that a sentence lists
+_MANY = 30  # number of projections: a smaller scan within 6.28 degrees may be a test, and is not reported as radians
 
 
 def angles_unknown(scan: ScanEvidence) -> str:
-    """Which projections have no finite angle."""
+    """Every projection has a finite angle; otherwise the finding names the projections without one."""
     unknown = np.setdiff1d(views := scan.table.views, scan.table.views_with_angles)
     why = f"; {why}" if (why := scan.source.attributes.get("angles")) else ""
     runs = np.split(unknown, np.flatnonzero(np.diff(unknown) > 1) + 1)
@@ -38,7 +39,7 @@ def angles_unknown(scan: ScanEvidence) -> str:
 
 
 def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
-    """The projections have different directions, over 180 degrees, and their angles may be in degrees."""
+    """The projections have different directions over 180 degrees, and their angles can be in degrees."""
     angles = scan.table.angles[scan.table.views]
     if angles.size < 2 or not np.isfinite(angles).all():
         return
@@ -62,7 +63,7 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
         return
     step = span / (distinct.size - 1)
     if (text := _no_degrees(angles, distinct)) is not None:
-        # A plan is of this program's own scans, whose angles are in degrees.
+        # A plan belongs to a scan of this program, whose angles are in degrees.
         yield Finding("warning" if scan.source.plan else "error", "angle-spread", text)
     elif (unseen := half_turn_unseen(angles)) > 0:
         span_text = f"span {span:.2f} degrees, less than 180" if span + step < 180 else "do not cover 180 degrees"
@@ -84,45 +85,49 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def directions(angles: NDArray[np.float64]) -> int:
-    """The directions of the rays of parallel projections [view], in rad: projections 180 degrees apart have the same
-    directions."""
+    """The directions of the rays of parallel projections [view], in rad. Projections that are 180 degrees apart have
+    the same direction.
+    """
     half = np.mod(np.degrees(angles), 180.0)
     return int(np.unique(np.round(np.where(half > 180.0 - _EQUAL, 0.0, half) / _EQUAL)).size)
 
 
 def half_turn_unseen(angles: NDArray[np.float64]) -> float:
-    """How many of the 180 degrees have no projection, apart from the normal spacing of the projections [view] in rad:
-    the largest gap, or all gaps.
+    """How much of the 180 degrees has no projection, beyond the normal spacing of the projections: the largest gap, or
+    all gaps together. `angles` are [view], in rad.
 
-    All gaps that `angular_weights` regards as missing projections are counted, if together they are a twentieth of 180
-    degrees.
+    All gaps are added up if `angular_weights` regards them as missing projections and they are together at least a
+    twentieth of 180 degrees.
 
-    Projections 180 degrees apart see the same rays. If angles are random, the largest gap exceeds the second largest by
-    an exponentially distributed length, whose mean is the mean gap (Rényi 1953). With random angles, 2 in 1000 scans of
-    45 or more projections, and 1 in 100 scans of ten projections, exceed the allowed gap. If the angles are evenly
-    spaced, all gaps are equal, and a gap that is larger by half a degree is reported.
+    Projections that are 180 degrees apart see the same rays. If angles are random, the largest gap exceeds the second
+    largest by an exponentially distributed amount, whose mean is the mean gap (Rényi 1953). With random angles, the
+    allowed gap is exceeded by 2 in 1000 scans with 45 or more projections, and by 1 in 100 scans with ten projections.
+    If the angles are evenly spaced, a gap that is larger than the others by half a degree is reported.
     """
     places = np.sort(np.mod(np.degrees(angles), 180.0))
     gaps = np.diff(places, append=places[0] + 180.0)
-    gaps = gaps[gaps > _SAME * 180.0 / places.size]  # projections side by side are one
+    gaps = gaps[gaps > _SAME * 180.0 / places.size]  # neighbouring projections count as one
     if gaps.size < 2:
         return 180.0
     *others, second, largest = np.sort(gaps)
     uneven = float(np.std([*others, second])) / _OF_MEAN
     n = len(others) + 1
-    times = n * (_FALSE_ALARM ** (-1 / n) - 1)  # 6.9 of a mean that is known; more where it is estimated from n gaps
+    # 6.9 mean gaps, if the mean gap is known; more if it is estimated from n gaps
+    times = n * (_FALSE_ALARM ** (-1 / n) - 1)
     limit = second + max(_GAP, times * uneven)
     if not np.isclose(largest, 180.0 - np.ptp(np.degrees(angles)), atol=_GAP):
-        limit = max(limit, 2 * float(np.median(gaps)) + _GAP)  # within the projections: one that was lost is no wedge
+        # only between the first and the last projection: a single lost projection is not a missing wedge
+        limit = max(limit, 2 * float(np.median(gaps)) + _GAP)
     unweighed = 180.0 - float(np.degrees(angular_weights(angles).sum()))
     return max(float(largest) if largest > limit else 0.0, unweighed if unweighed > _UNWEIGHED else 0.0)
 
 
 def _no_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64]) -> str | None:
-    """What shows that angles [view], in rad as they were read, were not in degrees; None if they may have been.
+    """A sentence that says why angles [view], which were read as degrees and converted to rad, cannot have been in
+    degrees. None if they can.
 
     Args:
-        distinct: the same in degrees, each once and ascending.
+        distinct: the different angles in degrees, ascending.
     """
     between = float(np.median(np.abs(np.diff(np.degrees(angles)))))
     if look_like_degrees(angles):
@@ -147,7 +152,9 @@ def _no_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64]) -> s
 
 
 def _smaller_unit(degrees: NDArray[np.float64], n: int) -> str | None:
-    """What n angles under a label of degrees, distinct and ascending, are instead; None if they may be degrees."""
+    """The true quantity of n angles that are labelled as degrees (distinct and ascending). None if they can be
+    degrees.
+    """
     if part := gone_round(degrees, 2 * np.pi):
         return f"these look like radians: {'180 degrees are' if part < 4 else '360 degrees are'} {part:.5g}."
     return "these look like radians or turns." if n > _MANY and np.ptp(degrees) <= 2 * np.pi else None

@@ -1,5 +1,5 @@
-"""Rules that compare angles with images: projections of the same rays, by their stated angles, look the same, and no
-others do.
+"""Rules that compare stated angles with images: projections look the same if, and only if, their angles say that they
+see the same rays.
 """
 
 from __future__ import annotations
@@ -18,21 +18,27 @@ from recon.base.views import spread
 from recon.prep.align import mirror_mismatch
 from recon.prep.unmeasured import DARK
 
-_LEAST_SEEN = 8  # projections, and columns: fewer do not show a turn
-OTHER = 0.08  # of 180 degrees, and two steps: nearer ones are alike where the projection that is sought was spoilt
-_FACTORS = 2.0, 0.5  # of degrees in what is stated: twice or half the turn, by a gear or its pulses
-PAIRS = 6  # of projections that are stated 180 degrees apart, which are compared
-UNLIKE = 4.0  # times as different: twice as far from one another, since a small turn shows by its square
-_FINE = 90  # of the range of angles: neighbours that tell how much a small turn changes a projection
-_AROUND = 9  # projections about the best of some that are looked at
-_LEAST_INTENSITY = 1e-3  # of the beam
-_FAR, _NEXT = 4.0, 1.5  # steps from which two projections are stated to be apart, and up to which side by side
-_SINGLE = 0.1  # of the projections: so few wrong angles are named one by one
-_MIRRORED = 0.5  # of 1: how alike sums of directions are, 0 if they spread evenly, as of frames taken in passes
-# of some projections: as many look like others that are far from them, if the frames were in another order
+_LEAST_SEEN = 8  # fewest projections, and fewest columns, with which a rotation is visible
+# share of 180 degrees, and number of steps: if the projection that is sought is spoilt, nearer ones look similar
+OTHER = 0.08
+_FACTORS = 2.0, 0.5  # factors on the stated angles: twice or half the rotation, because of a gear or its pulses
+PAIRS = 6  # number of projections that are compared with the projection at 180 degrees
+# factor on the difference: twice as far apart in angle, because the difference grows with the square of a small
+# rotation
+UNLIKE = 4.0
+_FINE = 90  # share of the range of angles: neighbours within it show how much a small rotation changes a projection
+_AROUND = 9  # number of projections that are compared around the best of a first selection
+_LEAST_INTENSITY = 1e-3  # share of the beam
+# steps: projections that are at least so far apart count as distant, and up to so far as neighbours
+_FAR, _NEXT = 4.0, 1.5
+_SINGLE = 0.1  # share of the projections: if so few angles are wrong, they are named one by one
+_MIRRORED = 0.5  # how much the sums of directions agree, from 0 (evenly spread, as for frames taken in passes) to 1
+# share of some projections that look like distant ones, if the frames are in another order
 _MOST = 0.75
-_STANDS, _TURNED = 3, 2.0  # frames of one angle; times as different from the first: 1 at rest, 4 after two steps
-_EQUAL = 1e-6  # 1 minus the correlation of equal frames, which rounding makes a little more or less than 0
+# fewest frames at one angle; ratio of the difference from the first frame: 1 if the stage stands still, 4 after two
+# steps
+_STANDS, _TURNED = 3, 2.0
+_EQUAL = 1e-6  # 1 minus the correlation of equal frames; rounding changes it a little
 ORDER = "angle-order"
 Pair = tuple[int, int]
 
@@ -42,8 +48,8 @@ class CoarseViews:
     """Coarse line integrals of projections of a scan, each read once.
 
     Attributes:
-        rows: projections that have an angle and can be read, in the order of the file.
-        degrees: float64 [frame], as stated.
+        rows: the projections that have an angle and can be read, in the order of the file.
+        degrees: float64 [frame], the stated angles.
     """
 
     scan: ScanEvidence
@@ -52,8 +58,9 @@ class CoarseViews:
     _depths: dict[int, NDArray[np.float64]] = field(default_factory=dict)
 
     def depth(self, row: int) -> NDArray[np.float64]:
-        """Line integrals [row, col] of a projection, minus the mean of each row, and smoothed along the rows, which
-        removes two columns."""
+        """Line integrals [row, col] of a projection, minus the mean of each row, smoothed along the rows. The smoothing
+        removes two columns.
+        """
         if row not in self._depths:
             lines = self._lines(row)
             lines = (lines[:, :-2] + 2 * lines[:, 1:-1] + lines[:, 2:]) / 4
@@ -74,43 +81,45 @@ class CoarseViews:
         if self.scan.beam is None:
             return bool(np.ptp(self._lines(row)))
         cells, (dark, flat) = self.scan.frame(row).places, self.scan.beam
-        if (lit := lit_places(flat - dark)).any():  # opaque from top to bottom, as what is not of the sample
+        # something that is opaque from top to bottom is not part of the sample
+        if (lit := lit_places(flat - dark)).any():
             posts = ((cells - dark < DARK * (flat - dark)) | ~lit).all(axis=0) & lit.any(axis=0)
             if posts.any():
                 return False
         return brightness(cells, dark, flat) > LEAST * self.scan.brightest
 
     def lit(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether projections have beam and show a sample [view]."""
+        """bool [view], True if the projection has beam and shows a sample."""
         return np.array([self._is_lit(row) for row in rows.tolist()], np.bool_)
 
     def lit_pairs(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[Pair]:
-        """A few pairs of projections, evenly spread, both with beam."""
+        """A few of the pairs of projections, evenly spread. Both projections of a pair have beam."""
         some = spread(np.arange(first.size), PAIRS)
         some = some[self.lit(first[some]) & self.lit(second[some])]
         return list(zip(first[some].tolist(), second[some].tolist(), strict=True))
 
     def unlike(self, pair: Pair, mirrored: bool = False) -> float:
-        """1 minus the correlation of two projections. For mirror images, the second projection is mirrored about the
-        column of best agreement. This column is searched for in the middle half of the detector, and in its whole width
-        if the best column is at the edge of this half."""
+        """1 minus the correlation of two projections. To compare mirror images, the second projection is mirrored about
+        the column with the best agreement. This column is searched for in the middle half of the detector. If the best
+        column is at the edge of this half, the whole width is searched.
+        """
         one, other = self.depth(pair[0]), self.depth(pair[1])
         if not mirrored:
             power = float(np.linalg.norm(one) * np.linalg.norm(other))
             return 1 - float((one * other).sum()) / power if power > 0 else 1.0
-        places = np.arange(0, one.shape[1] - 0.9, 0.5)  # half columns, since edges are sharp
+        places = np.arange(0, one.shape[1] - 0.9, 0.5)  # half columns, because edges are sharp
         one, other = (np.stack([np.interp(places, places[::2], row) for row in image]) for image in (one, other))
         cols = one.shape[1]
         for reach in (cols // 4, cols // 2):
             curve = mirror_mismatch(one, other, (cols - 1 + np.arange(-reach, reach + 1)) / 2)
-            at = int(np.argmin(curve))
-            if 0 < at < 2 * reach:
-                below, here, above = curve[at - 1 : at + 2]
+            lowest = int(np.argmin(curve))
+            if 0 < lowest < 2 * reach:
+                below, here, above = curve[lowest - 1 : lowest + 2]
                 return max(float(here - (below - above) ** 2 / 8 / max(below - 2 * here + above, 1e-12)), 0.0)
         return float(curve.min())
 
     def all_unlike(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """`unlike` of every two of these projections [view, view]."""
+        """[view, view] `unlike` for each pair of these projections."""
         depths = np.stack([self.depth(row).ravel() for row in rows.tolist()])
         norms = np.array([np.linalg.norm(depth) for depth in depths])
         products = np.stack([(depth * depths).sum(axis=1) for depth in depths])
@@ -118,25 +127,27 @@ class CoarseViews:
         return 1 - np.divide(products, powers, out=np.zeros_like(powers), where=powers > 0)
 
     def typical(self, pairs: Sequence[Pair]) -> float:
-        """Median of `unlike`."""
+        """Median of `unlike` over the pairs."""
         return float(np.median([self.unlike(pair) for pair in pairs]))
 
 
 def coarse_views(scan: ScanEvidence) -> CoarseViews | None:
-    """The coarse projections of a scan, if it has enough projections, and their line integrals are known."""
+    """The coarse projections of a scan. Empty if there are too few projections, or if their line integrals are
+    unknown.
+    """
     views = scan.table.views_with_angles
     if scan.source.quantity == "unknown" or scan.table.shifts is not None:
         return None
     lacking = scan.in_counts and not scan.table.has(FrameKind.DARK, FrameKind.FLAT)
     if lacking or min(scan.source.shape[1], views.size) < _LEAST_SEEN:
         return None
-    _ = scan.brightest  # by frames of which some may turn out to be unreadable
+    _ = scan.brightest  # some of these frames may turn out to be unreadable
     views = np.array([row for row in views.tolist() if row not in scan.source.unreadable], np.int64)
     return CoarseViews(scan, views, np.degrees(scan.table.angles)) if views.size >= _LEAST_SEEN else None
 
 
 def angles_shown(scan: ScanEvidence) -> Iterator[Finding]:
-    """Projections show the turns, and the order of angles, that the file states."""
+    """The projections agree with the rotation and with the order of angles that the file states."""
     if (seen := coarse_views(scan)) is not None:
         yield from angles_stand(seen)
         yield from angles_seen(seen)
@@ -144,7 +155,7 @@ def angles_shown(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
-    """Consecutive frames stated at one angle look the same, as those that are averaged do.
+    """Consecutive frames with the same stated angle look the same, as frames do that are to be averaged.
 
     If the stage kept rotating, the last frame differs from the first one by more than neighbouring frames do: the
     squared difference grows with the square of the rotation.
@@ -176,10 +187,11 @@ def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
 
 
 def angles_seen(seen: CoarseViews) -> Iterator[Finding]:
-    """Parallel projections 180 degrees apart by their angles are mirror images, and no others are.
+    """Parallel projections are mirror images if, and only if, their angles are 180 degrees apart.
 
-    Rays measure the same from both sides, for any sample, even one that is wider than the field of view. The difference
-    between neighbours shows the effect of a rotation on this sample, and of noise: a round sample shows no angles.
+    A ray measures the same from both sides. This is true for any sample, even one that is wider than the field of view.
+    The difference between neighbouring projections shows how a rotation, and noise, changes the projections of this
+    sample: a round sample looks the same at all angles.
     """
     if seen.scan.cone is not None:
         return
@@ -204,13 +216,15 @@ def _some_lit(seen: CoarseViews, views: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _nearest(seen: CoarseViews, views: NDArray[np.int64], degrees: NDArray[np.float64]) -> NDArray[np.int64]:
-    """The projection that is stated nearest to each of these angles."""
+    """The projection whose stated angle is nearest to each of these angles."""
     return views[np.abs(seen.degrees[views] - degrees[:, None]).argmin(axis=1)]
 
 
 @dataclass(frozen=True)
 class _Turn:
-    """Two frames that look 180 degrees apart, and two that are stated to be; None: none are."""
+    """A pair of frames that look 180 degrees apart, and a pair whose stated angles are 180 degrees apart. None: there
+    is no such pair.
+    """
 
     alike: Pair
     degrees: float
@@ -218,11 +232,11 @@ class _Turn:
 
 
 def _turn_seen(seen: CoarseViews, views: NDArray[np.int64], some: NDArray[np.int64], near: float) -> _Turn | None:
-    """Projections that repeat after another angle than they should, where those that should do not.
+    """Pairs of projections that look the same after a wrong angle, if those that should look the same do not.
 
     Args:
-        views, some: all, and some of them, by ascending angle.
-        near: how much neighbours of these some differ.
+        views, some: all projections, and some of them, by ascending angle.
+        near: how much the neighbours of the selected projections differ.
     """
     degrees = seen.degrees
     step = float(np.ptp(degrees[some])) / (some.size - 1)
@@ -230,7 +244,7 @@ def _turn_seen(seen: CoarseViews, views: NDArray[np.int64], some: NDArray[np.int
     within = min(float(np.median(np.diff(np.unique(degrees[views])))), step)
     pairs = np.abs(degrees[partner] - degrees[some] - 180) <= within
     stated = seen.lit_pairs(some[pairs], partner[pairs])
-    # The most alike of them: a loose particle makes one pair unlike, wrong angles make all.
+    # The most similar pairs decide: a loose particle makes one pair different, wrong angles make all pairs different.
     off = min((seen.unlike(pair, mirrored=True) for pair in stated), default=np.inf)
     if off < 2 * UNLIKE * near:
         return None
@@ -261,8 +275,9 @@ def _angles_finding(scan: ScanEvidence, degrees: NDArray[np.float64], turn: _Tur
     )
     if turn.stated is not None:
         pairs += f"; frames {turn.stated[0]} and {turn.stated[1]}, stated 180 degrees apart, are not mirror images"
-    # A plan is of this program's own scans, whose angles are in degrees. Without projections stated 180 degrees apart,
-    # a symmetric sample may look so, too. Mistakes are by one of these factors, while a sample that moves may show any.
+    # A plan belongs to a scan of this program, whose angles are in degrees. If no projections have stated angles 180
+    # degrees apart, a symmetric sample may look the same, too. Mistakes are by one of these factors, while a moving
+    # sample may repeat after any angle.
     sure = not scan.source.plan and turn.stated is not None and (counted or bool(known))
     which = "The" if sure else "Unless the sample moved or is symmetric, the"
     return Finding(
@@ -275,8 +290,8 @@ def _angles_finding(scan: ScanEvidence, degrees: NDArray[np.float64], turn: _Tur
 def angles_in_order(seen: CoarseViews) -> Iterator[Finding]:
     """Consecutive frames look similar only if their angles are close, and close angles look similar.
 
-    This finds a list in another order than the frames, and a single wrong angle. If the list is shifted, only one of
-    many projections shows it, so the rule checks the places where the angles jump.
+    The rule finds a list of angles in another order than the frames, and single wrong angles. If the list is shifted,
+    this is visible only where the angles jump, so the rule checks these places.
     """
     rows, degrees = seen.rows, seen.degrees[seen.rows] % 360
     order = np.argsort(degrees, kind="stable")
@@ -295,10 +310,11 @@ def angles_in_order(seen: CoarseViews) -> Iterator[Finding]:
 
 
 def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Finding | None:
-    """Most projections look more like one that is far from them than like their neighbours; rows by ascending angle.
+    """True if most projections look more like a distant projection than like their neighbours. `rows` are in ascending
+    order of angle.
 
-    Of two measured scans (the tooth, Diamond) as if taken in 2, 3, 4 and 6 passes, 5 of 8 show it, those of two passes
-    never; as they were taken, none.
+    Test on two measured scans (the tooth, Diamond) that were reordered as if taken in 2, 3, 4 and 6 passes: the rule
+    finds 5 of these 8, but not the two with 2 passes. In the original order it reports neither scan.
     """
     some = _some_lit(seen, rows)
     if some.size < PAIRS:
@@ -313,7 +329,8 @@ def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Finding | No
     far = np.nan_to_num(far, nan=np.inf)
     like, neighbours = far.argmin(axis=1), np.minimum(np.append(beside, np.inf), np.append(np.inf, beside))
     odd = far.min(axis=1) < np.minimum(neighbours, usual / UNLIKE)
-    # A sample with a plane of symmetry looks the same from directions that mirror each other: their sums are equal.
+    # A sample with a plane of symmetry looks the same from directions that mirror each other: the sums of such
+    # directions are equal.
     sums = np.radians(degrees[odd] + degrees[like[odd]])
     if odd.mean() < _MOST or abs(np.exp(1j * sums).mean()) > _MIRRORED:
         return None
@@ -335,7 +352,7 @@ def _stated(seen: CoarseViews, pair: Pair) -> str:
 
 def _in_another_order(seen: CoarseViews, jumps: NDArray[np.int64], far: Pair, near: Pair) -> Finding:
     text = f"{_stated(seen, far)} look similar, but f{_stated(seen, near)[1:]} do not. "
-    single = np.intersect1d(jumps, jumps + 1)  # between two jumps
+    single = np.intersect1d(jumps, jumps + 1)  # between two jumps of the angles
     if single.size and jumps.size == 2 * single.size and single.size <= _SINGLE * seen.rows.size:
         wrong = ", ".join(f"{row} ({seen.degrees[row]:.6g})" for row in seen.rows[single[:5]].tolist())
         text += f"The angles of {single.size} projections are not between those of their neighbours: frames {wrong}. "

@@ -1,5 +1,5 @@
-"""Evidence of a scan: facts from its darks, flats and some projections, computed once per job from frames read once,
-and passed on.
+"""Evidence of a scan: facts computed from its darks, flats and some projections. Each job reads the frames and computes
+the facts once, and then passes them on.
 """
 
 from __future__ import annotations
@@ -27,33 +27,35 @@ from recon.base.views import spread
 from recon.prep.references import dark_at
 from recon.prep.unmeasured import with_borders_filled
 
-# projections that flats must not look like: so many of all, and so many on either side of each group
+# number of projections with which flats are compared: from the whole scan, and on each side of each group of flats
 VIEWS, BESIDE = 32, 2
-CELLS_ACROSS = 32  # flats are compared with projections by means of pixels: the frame is about so many wide
-WORST = 99.0  # percentile of the places of a projection that counts, so that zingers do not
-EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
-# fraction of the intensity of the brightest projections that the bright part of every projection exceeds, because the
-# sample does not cover the whole frame
+# flats are compared with projections by means over groups of pixels: a frame has about so many groups across
+CELLS_ACROSS = 32
+WORST = 99.0  # percentile of the groups of pixels of a projection; not the largest value, because of zingers
+EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure time by up to this share
+# fraction of the brightest projections' intensity that the bright part of every projection exceeds, because the sample
+# does not cover the whole frame
 LEAST = 0.01
-_SUSPECT = 0.1  # share of the intensity of the flats from which a projection is not looked at more closely
-_ACROSS = 32  # pixels a side, about, by which a projection is suspected
-_TAIL = 1.2816  # standard deviations: BRIGHT percent of noise are below
+_SUSPECT = 0.1  # share of the flats' intensity: a brighter projection is not examined more closely
+_ACROSS = 32  # approximate number of pixels along each side in which a projection is first checked
+_TAIL = 1.2816  # standard deviations of the noise: BRIGHT percent of the noise are below
 
 
 class ReferenceGroups(NamedTuple):
-    """Rows of darks and of flats, by groups, in the order of the file."""
+    """Rows of the darks and of the flats, by groups, in the order of the file."""
 
     darks: tuple[I64, ...]
     flats: tuple[I64, ...]
 
 
 class EvidenceRequest(NamedTuple):
-    """What is asked of the evidence of a scan.
+    """Settings with which the evidence of a scan is computed.
 
     Attributes:
-        accepted: references are used as they are: their faults are warnings.
-        cone: mm from the source to the rotation axis and to the detector, instead of the values in the file.
-        judge: makes flags that are used instead of those in the file; None: those in the file are used.
+        accepted: True if the user accepts the darks and flats as they are. Their faults are then only warnings.
+        cone: distances in mm from the source to the rotation axis and to the detector, which replace the values in the
+            file.
+        judge: function that computes flags, which replace the flags in the file; None: the flags in the file are used.
         limits: limits for darks and flats; None: the default limits.
     """
 
@@ -65,14 +67,14 @@ class EvidenceRequest(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ScanEvidence:
-    """What darks, flats and some projections of a scan show, in addition to what its file states.
+    """Facts that the darks, flats and some projections of a scan show, in addition to what the file states.
 
-    It is computed once per job and passed on. For a running scan, `renewed` adds the frames recorded since then. Each
-    result is computed once, when it is first used, and each frame is read once.
+    A job creates it once and passes it on. For a running scan, `renewed` adds the new frames. Each fact is computed
+    when it is first used, and each frame is read once.
 
     Attributes:
         source: reads the frames.
-        table: what each frame was when the evidence was taken.
+        table: table of the frames at the time when the evidence was created.
     """
 
     source: ScanSource
@@ -85,7 +87,7 @@ class ScanEvidence:
         object.__setattr__(self, "table", self.source.table)
 
     def renewed(self) -> ScanEvidence:
-        """The evidence with the frames that are recorded by now."""
+        """The evidence with all frames that have been recorded until now."""
         return self if self.source.table is self.table else replace(self)
 
     @property
@@ -100,10 +102,10 @@ class ScanEvidence:
 
     @cached_property
     def flags(self) -> FrameFlags | None:
-        """Flags of all frames, those that count; None: there are none."""
+        """The flags of all frames that count; None: there are no flags."""
         return self.table.flags if self.asked.judge is None else self.asked.judge(self.source)
 
-    # References, by groups
+    # Darks and flats, by groups
 
     @cached_property
     def taken(self) -> ReferenceGroups:
@@ -112,56 +114,58 @@ class ScanEvidence:
 
     @cached_property
     def good(self) -> ReferenceGroups:
-        """The darks and flats without a fault; all of a kind, if all of them have a fault."""
+        """The darks and flats without a fault. If all frames of a kind have a fault, all of them."""
         bad = [row for each in self.findings if each.severity != "error" for row in each.frames]
         kept = ((np.setdiff1d(group, bad) for group in groups) for groups in self.taken)
         return ReferenceGroups(*(tuple(group for group in groups if group.size) for groups in kept))
 
     @property
     def used(self) -> ReferenceGroups:
-        """The references that correct the projections."""
+        """The darks and flats that are used to correct the projections."""
         return self.taken if self.asked.accepted else self.good
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings on darks and flats: errors if all frames of a kind have a fault. Flats are compared with the other
-        flats and with the projections of their part. There are no findings if pixels are not counts."""
+        """Findings about darks and flats. They are errors if all frames of a kind have a fault. Flats are compared with
+        the other flats, and with the projections of the same part of the scan. There are no findings if the pixels are
+        not counts.
+        """
         if not self.in_counts:
             return ()
-        darks, found = tuple(self._readable(group) for group in self.taken.darks), dict[Finding, None]()
+        darks, findings = tuple(self._readable(group) for group in self.taken.darks), dict[Finding, None]()
         for start, end in pairwise([*self.table.part_starts.tolist(), len(self.table)]):
             flats = [group for group in self.taken.flats if start <= group[0] < end]
             seen, views = tuple(self._readable(group) for group in flats), self.table.views_of(start, end)
             if flats or not self.taken.flats:
                 shown = Evidence((*darks, *seen), self._views_beside(views, flats))
-                found |= dict.fromkeys(reference_findings(shown, self.asked.limits))
-        rows = {row for finding in found for row in finding.frames}
+                findings |= dict.fromkeys(reference_findings(shown, self.asked.limits))
+        rows = {row for finding in findings for row in finding.frames}
         good = {self.table.kind(row) for groups in self.taken for group in groups for row in group if row not in rows}
         return tuple(
             replace(each, severity="warning") if each.frames and self.table.kind(each.frames[0]) in good else each
-            for each in found
+            for each in findings
         )
 
     def _views_beside(self, views: I64, flats: list[I64]) -> tuple[FrameStatistics, ...]:
-        """Projections of the whole part, and next to its flats."""
+        """Some projections from the whole part of the scan, and some next to its flats."""
         chosen = set(spread(views, VIEWS).tolist())
         for group in flats:
-            at = int(np.searchsorted(views, group[0]))
-            chosen.update(views[max(at - BESIDE, 0) : at + BESIDE].tolist())
+            place = int(np.searchsorted(views, group[0]))
+            chosen.update(views[max(place - BESIDE, 0) : place + BESIDE].tolist())
         return self._readable(np.array(sorted(chosen), np.int64))
 
     def _readable(self, rows: I64) -> tuple[FrameStatistics, ...]:
-        """The frames, of these rows, that can be read; all, if none can."""
+        """The rows that can be read; all rows if none can be read."""
         read = tuple(self.frame(row) for row in rows.tolist())
         return tuple(frame for frame in read if frame.row not in self.source.unreadable) or read
 
     # Frames
 
     def frame(self, row: int) -> FrameStatistics:
-        """Statistics of a frame of any kind, with its cells, which is read once.
+        """Statistics of a frame of any kind, with its cells (means over groups of pixels). The frame is read once.
 
-        The statistics are computed with the dark of the shortest exposure. If the exposures of projections differ, the
-        projections are scaled to the usual exposure.
+        The dark with the shortest exposure is used. If the exposures of projections differ, the projections are scaled
+        to the usual exposure.
         """
         frame, groups = self._as_it_is(row), self._darks
         differ = self.views_differ and groups[0][1].size > 0
@@ -171,7 +175,8 @@ class ScanEvidence:
 
         def levelled(part: str) -> F32:
             darks = [
-                (s, np.mean([getattr(self._as_it_is(at), part) for at in rows.tolist()], axis=0)) for s, rows in groups
+                (s, np.mean([getattr(self._as_it_is(dark_row), part) for dark_row in rows.tolist()], axis=0))
+                for s, rows in groups
             ]
             own = dark_at(frame.exposure, darks) if len(darks) > 1 else darks[0][1]
             level = darks[0][1] + (getattr(frame, part) - own) * np.float32(usual / frame.exposure)
@@ -180,7 +185,7 @@ class ScanEvidence:
         return replace(frame, blocks=levelled("blocks"), cells=levelled("cells"), exposure=usual)
 
     def _as_it_is(self, row: int) -> FrameStatistics:
-        table = self.table if row < len(self.table) else self.source.table  # a running scan has grown
+        table = self.table if row < len(self.table) else self.source.table  # the scan is running and has grown
         kind = table.kind(row)
         if row not in self._seen:
             image = read_known(self.source, [row])[0]
@@ -189,11 +194,11 @@ class ScanEvidence:
         return replace(self._seen[row], kind=kind, exposure=float(table.exposures[row]))
 
     def cells(self, rows: I64) -> list[F32]:
-        """Cells of some frames, one by one."""
+        """Yields the cells of some frames."""
         return [self.frame(row).places for row in rows.tolist()]
 
     def mean_cells(self, rows: I64) -> F32:
-        """Cells of the mean of the readable frames."""
+        """Cells of the mean over the readable frames."""
         cells = dict(zip(rows.tolist(), self.cells(rows), strict=True))
         known = [cells[row] for row in cells if row not in self.source.unreadable] or list(cells.values())
         return np.asarray(np.nan_to_num(np.mean(known, axis=0)), np.float32)
@@ -214,7 +219,9 @@ class ScanEvidence:
         return bool(views.size and (views > 0).all() and np.ptp(views) > EXPOSURE_TOLERANCE * np.median(views))
 
     def by_exposure(self, rows: I64) -> list[tuple[float, I64]]:
-        """The rows of each exposure among these frames; one group, of NaN, if one is unknown or all have one."""
+        """These frames grouped by exposure. There is a single group, with the exposure NaN, if an exposure is unknown
+        or if all frames have the same.
+        """
         seconds = self.table.exposures[rows]
         if not rows.size or not (seconds > 0).all() or np.ptp(seconds) <= EXPOSURE_TOLERANCE * seconds.min():
             return [(np.nan, rows)]
@@ -228,7 +235,7 @@ class ScanEvidence:
 
     @cached_property
     def exposures(self) -> F64:
-        """Exposure of each frame in s, NaN if unknown.
+        """Exposure of each frame in s; NaN if unknown.
 
         If the exposures of projections differ and the flats state none, the exposure of the flats is taken as the
         longest, the median or the shortest exposure of the projections: the first of these for which no place in the
@@ -249,11 +256,13 @@ class ScanEvidence:
                 return np.where(np.isin(np.arange(len(table)), flats), each, exposures)
         return exposures
 
-    # Light of whole projections; not of single bands of rows, where a sample may be opaque
+    # Intensity of whole projections; a single band of rows would not do, because the sample may be opaque there
 
     @cached_property
     def beam(self) -> tuple[F32, F32] | None:
-        """Cells [cell row, cell col] of the mean dark and flat that are used; None if nothing is divided by them."""
+        """Cells [cell row, cell col] of the mean dark and of the mean flat that are used; None if the projections are
+        not divided by flats.
+        """
         if not (self.in_counts and all(self.used)):
             return None
         dark, flat = (self.mean_cells(np.concatenate(groups)) for groups in self.used)
@@ -261,19 +270,20 @@ class ScanEvidence:
 
     @cached_property
     def brightest(self) -> float:
-        """Brightness of the brightest of some projections relative to the flats, see `brightness`; 1 if there are no
-        projections."""
+        """Brightness, relative to the flats, of the brightest of some projections (see `brightness`); 1 if there are no
+        projections.
+        """
         if self.beam is None:
             return 1.0
         seen = [brightness(cells, *self.beam) for cells in self.cells(spread(self.table.views, VIEWS))]
         return float(np.percentile(seen, BRIGHT)) if seen else 1.0
 
     def suspect(self, data: NDArray[np.generic], beam: tuple[F32, F32] | None) -> NDArray[np.bool_]:
-        """bool [view]: projections that are dark or uniform in the pixels read, which may be a band of rows.
+        """bool [view], True if a projection is dark or uniform in the given pixels, which may be a band of rows.
 
         Args:
             data: [view, row, col], as read.
-            beam: dark and flat [row, col], of the same pixels; None: line integrals.
+            beam: dark and flat [row, col] of the same pixels; None: the data are line integrals.
         """
         uniform = np.array([view.min() == view.max() for view in data], np.bool_)
         if beam is None or not len(data):
@@ -293,13 +303,13 @@ class ScanEvidence:
 
     @property
     def known_unlit(self) -> list[int]:
-        """The projections without beam, among those that were checked."""
+        """The projections without beam, among the checked ones."""
         return [row for row, lit in self._lit.items() if not lit]
 
     def _unlit(self, row: int) -> bool:
         image = read_known(self.source, [row])[0]
         if row in self.source.unreadable:
-            return False  # it is named and left out by who reads it
+            return False  # the caller names the frame and leaves it out
         if not np.isfinite(image).any():
             return True
         same = bool(image.min() == image.max())
@@ -310,11 +320,13 @@ class ScanEvidence:
 
 
 def groups_of(table: FrameTable, kind: FrameKind) -> tuple[I64, ...]:
-    """Rows of the darks or flats, by groups: a group is a series of them in one part of the scan without a projection
-    in between."""
+    """Rows of the darks or flats, by groups: a group is a series of frames in one part of the scan without a projection
+    in between.
+    """
     rows = table.of_kind(kind)
     before = np.searchsorted(table.views, rows)
-    before += np.searchsorted(table.part_starts, rows, "right")  # neither decreases, so that the sum tells both
+    # neither number decreases, so their sum identifies both
+    before += np.searchsorted(table.part_starts, rows, "right")
     return tuple(np.split(rows, np.flatnonzero(np.diff(before)) + 1)) if rows.size else ()
 
 
@@ -329,8 +341,9 @@ def look_at(image: NDArray[Any], row: int) -> FrameStatistics:
 
 
 def brightness(view: F32, dark: F32, flat: F32) -> float:
-    """Brightness of a projection's bright part relative to the flats, corrected for the bias by noise; from images of
-    cells."""
+    """Brightness of the bright part of a projection relative to the flats, from images of cells. It is corrected for
+    the bias that noise causes.
+    """
     intensity = flat - dark
     lit = lit_places(intensity)
     if not lit.any():

@@ -1,5 +1,5 @@
-"""FlagPolicy: which projections a reconstruction drops or gives less weight because of monitor flags, and the
-messages about it.
+"""FlagPolicy: decides which projections a reconstruction leaves out, or gives less weight, because of flags of the
+monitor. Also makes the messages about it.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.arrays import Mask
 
 FLAGS = "flags"
-LARGEST = 0.5  # of the projection: a flag with a larger region, or none, is of the whole projection
-MARGIN = 0.25  # of the region's shorter side, on all sides
+# share of the projection: a flag with a larger region, or without a region, applies to the whole projection
+LARGEST = 0.5
+MARGIN = 0.25  # share of the region's shorter side that is added on all sides
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,12 +31,12 @@ class FlagPolicy:
     """How the flagged projections of a scan are treated.
 
     Attributes:
-        flags: the flags of all frames that are used here.
-        views, left_out, halved, masked: bool [frame of the file]: the projections; projections with an alarm, which are
-            left out; projections with a warning, which have half the weight; projections flagged in a region, whose
-            rays have less weight there.
+        flags: the flags of all frames that this policy uses.
+        views, left_out, halved, masked: bool [frame of the file]: True for, in this order: all projections; projections
+            with an alarm, which are left out; projections with a warning, which have half the weight; projections that
+            are flagged in a region, in which their rays have less weight.
         jumps: int64, ascending, the first rows after each jump of the sample that the monitor reported.
-        parts: regions of frames that are flagged only in some: the frame, the region, and whether it has an alarm.
+        parts: the flagged regions of frames: the frame, the region, and whether the flag is an alarm.
     """
 
     flags: FrameFlags
@@ -48,7 +49,7 @@ class FlagPolicy:
 
     @property
     def in_words(self) -> str:
-        """One sentence; empty if no projection is flagged."""
+        """A sentence about the flagged projections; empty if no projection is flagged."""
         parts = []
         for some, verbs in (
             (self.left_out, (("has an alarm and is", "have an alarm and are"), "left out")),
@@ -64,15 +65,15 @@ class FlagPolicy:
 
 
 def flag_policy(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> FlagPolicy:
-    """How `beamline recon` treats these projections, whose frames have this shape, unless it ignores flags.
+    """The policy of `beamline recon` for these projections, unless it ignores flags. Frames have this shape.
 
-    A projection in which the sample jumped is as good as the projections after it. The flags of the check `opposite`
-    for the same jump are then not used.
+    A projection in which the sample jumped is as good as the projections after it. If the check `opposite` also flagged
+    this jump, its flags are not used.
     """
     jumps = [flags.rows(entry, Level.ALARM) for entry in flags.legend if entry.bit == MotionCheck.bit]
     jumped = np.concatenate([np.zeros(0, np.int64), *jumps])
     flags = flags.without(MotionCheck.bit)
-    if jumped.size:  # what projections from the other side show of the jump goes with the projections beyond it
+    if jumped.size:  # a jump that opposite projections show is handled together with the projections after the jump
         flags = flags.without(OppositeCheck.bit)
     boxes = [
         (frame, box, bool(flags.bits[frame] >> entry.alarm_bit & 1))
@@ -89,10 +90,11 @@ def flag_policy(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> FlagP
 def boxes_of(
     flags: FrameFlags, check: int, entry: FlagBit, shape: tuple[int, int]
 ) -> Iterator[tuple[int, PixelBox | None]]:
-    """Frames that a check flagged, each with its region and a margin; None for (nearly) the whole projection.
+    """The frames that a check flagged, each with the flagged region and a margin. None instead of the region: nearly
+    the whole projection is flagged.
 
-    If a check flagged a projection only after later ones, the file has no region for this projection. Its region is
-    then found on a straight line through the regions of the later projections.
+    A check may flag a projection only when it has seen later ones. The file then has no region for this projection, and
+    its region is extrapolated along a straight line through the regions of the later projections.
     """
     rows = np.flatnonzero(flags.bits >> entry.bit & 1)
     for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
@@ -103,7 +105,8 @@ def boxes_of(
             for side in range(4):
                 values = boxes[known, side]
                 boxes[~known, side] = (
-                    values[0] if line is None else line(run[known], values, 1)(run[~known])  # ends move alike
+                    # the ends of the regions move in the same way
+                    values[0] if line is None else line(run[known], values, 1)(run[~known])
                 )
         for frame, box in zip(run.tolist(), boxes, strict=True):
             top, bottom, left, right = box
@@ -118,7 +121,9 @@ def boxes_of(
 
 
 FEWEST_VIEWS = 10
-"""Views without an alarm that a volume takes at least, where some have one: so few are a sketch of the sample."""
+"""Least number of projections without an alarm that a volume needs, if some projections have an alarm. A volume from so
+few projections is only a sketch of the sample.
+"""
 
 
 def frames_flagged(scan: ScanEvidence) -> Iterator[Finding]:

@@ -22,30 +22,36 @@ from recon.base.arrays import F32, F64, I64
 from recon.base.noise import deviation_between_frames
 from recon.base.views import spread
 
-VIEWS = 8  # that are looked at
-AT_THE_ENDS = 1e-3  # share of a projection's pixels that its least and its largest number may have, where it was scaled
-ALIKE = 6  # pixels, at most, that had one count by chance before they were scaled
-SPREAD = 16  # grey values between them, at least, where they are whole numbers
-WARN = 0.45  # line integral of air: the beam of Diamond 24737 lost 0.39 from its flat to its projections, others 0.02
-REFUSE = 0.65  # half of the intensity, which goes by no drift, decay or top-up; see ReferenceLimits.light_gone
-BRIGHTER = 0.2  # line integral by which a ring that is filled again makes projections brighter than their flats
-NOISIER = 1.5  # times; 67 random scans have 0.3 to 0.98, as structure of the sample adds to the noise of projections
-ROWS, LEAST_FLATS = 128, 3  # whose noise is looked at
-TILE, QUIET = 8, 20.0  # pixels a side, whose variance is known to a fifth; percentile of the tiles
+VIEWS = 8  # frames that are examined
+# largest share of a projection's pixels that have its smallest, and its largest, value, if projections were rescaled
+# one by one
+AT_THE_ENDS = 1e-3
+ALIKE = 6  # most pixels that have the same count by chance before the rescaling
+SPREAD = 16  # fewest grey values between smallest and largest value, if values are integers
+# line integral of air: the beam of Diamond 24737 lost 0.39 between its flats and its projections, other scans 0.02
+WARN = 0.45
+REFUSE = 0.65  # half of the intensity; drift, decay and top-up do not change it so much; see ReferenceLimits.light_gone
+BRIGHTER = 0.2  # line integral: a refill of the storage ring makes projections brighter than their flats by this much
+# ratio of the noise; 67 random scans have 0.3 to 0.98, because structure of the sample adds to the noise of projections
+NOISIER = 1.5
+ROWS, LEAST_FLATS = 128, 3  # frames whose noise is examined
+TILE, QUIET = 8, 20.0  # side of a tile in pixels, with which the variance is known to a fifth; percentile of the tiles
 BELOW, OF_VIEWS = (
     0.005,
     0.25,
-)  # shares of the lit places and of the projections that lie below the darks: no spots, no lost rows
-# errors of flats and darks, as fractions of the intensity, whose effect a message states if no air is visible
+    # shares of the places with beam, and of the projections, that lie below the darks; smaller shares may be zingers or
+    # lost rows
+)
+# errors of flats and darks, as shares of the intensity, whose effect a message states if no air is visible
 BRIGHTER_FLATS, HIGHER = 0.1, 0.01
-"""Limits, each with its reason."""
+"""Limits and their reasons."""
 
 
 def references_usable(scan: ScanEvidence) -> Iterator[Finding]:
-    """Flats get beam, are complete and even, and darks are dark; a faulty group is left out if there is a good one.
+    """Flats have beam, and are complete and even. Darks are dark. A faulty group is left out if there is a good group.
 
-    The finding is an error if all groups of a kind have a fault, otherwise a warning; it is also a warning if the user
-    accepts the groups.
+    The finding is an error if all groups of a kind have a fault and the user has not accepted them. Otherwise it is a
+    warning.
     """
     for finding in scan.findings:
         message = finding.message
@@ -65,8 +71,9 @@ def references_usable(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def views_scaled(scan: ScanEvidence) -> Iterator[Finding]:
-    """Finds projections that were rescaled one by one: all have the same smallest and the same largest value, at
-    different pixels."""
+    """Finds projections that were rescaled one by one: all of them have the same smallest value and the same largest
+    value, at different pixels.
+    """
     rows = scan.table.views
     if rows.size < VIEWS:
         return
@@ -96,11 +103,12 @@ def views_scaled(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def check_air_level(scan: ScanEvidence, level: float, air: bool, accepted: bool = False) -> Iterator[Finding]:
-    """The air of projections is as bright as their flats, apart from the usual drift of a beam during a scan.
+    """The air in projections is as bright as in their flats, apart from the usual drift of the beam during a scan.
 
     Args:
-        level: line integral of the air, the median of the projections; without air, of the place that absorbs least.
-        air: True if columns of air were found, and their line integral was subtracted.
+        level: line integral of the air, median over the projections. If there is no air: line integral of the place
+            that absorbs least.
+        air: True if air columns were found and their line integral was subtracted.
         accepted: True if a fault is only a warning.
     """
     darker = level > WARN and air
@@ -139,12 +147,13 @@ def check_air_level(scan: ScanEvidence, level: float, air: bool, accepted: bool 
 
 
 def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
-    """Darks are images, nowhere brighter than the projections, and air is not saturated."""
+    """Darks are measured images, they are nowhere brighter than the projections, and air is not saturated."""
     if scan.beam is None:
         return
-    dark, flat = np.min(scan.cells(np.concatenate(scan.used.darks)), axis=0), scan.beam[1]  # zingers light single darks
+    # there are zingers in single darks
+    dark, flat = np.min(scan.cells(np.concatenate(scan.used.darks)), axis=0), scan.beam[1]
     of_one = max(scan.used.flats, key=len)[:2] if not dark.any() else np.zeros(0, np.int64)
-    two = read_known(scan.source, of_one).astype(np.float64)  # alike where one image was written for them all
+    two = read_known(scan.source, of_one).astype(np.float64)  # identical if one image was written for all of them
     if len(two) > 1 and deviation_between_frames(two) and not counts_photons(scan.source):
         yield Finding(
             "warning",
@@ -173,7 +182,7 @@ def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def _counts_in_words(scan: ScanEvidence) -> str:
-    """Sentences on counts and exposures of flats and projections, where projections are brightest."""
+    """Sentences about counts and exposures of flats and projections, at the place where projections are brightest."""
     views = spread(scan.table.views, VIEWS)
     darks, flats = (np.concatenate(groups) for groups in scan.used)
     seen, flat, dark = (scan.mean_cells(rows) for rows in (views, flats, darks))
@@ -185,7 +194,7 @@ def _counts_in_words(scan: ScanEvidence) -> str:
 
 
 def _exposures_in_words(scan: ScanEvidence, *rows: NDArray[np.int64]) -> str:
-    """A sentence on the exposures that the file states of some flats and projections."""
+    """A sentence about the exposures that the file states for some flats and projections."""
     exposed = [scan.table.exposures[some] for some in rows]
     if all(np.isfinite(each).all() for each in exposed):
         words = [f"{np.median(each):g} s" for each in exposed]
@@ -194,12 +203,12 @@ def _exposures_in_words(scan: ScanEvidence, *rows: NDArray[np.int64]) -> str:
 
 
 def without_air(scan: ScanEvidence, mean: float) -> str:
-    """Sentences on what wrong flats and darks do to line integrals (their mean) of projections in which no column is
+    """Sentences about the effect of wrong flats and darks on the mean line integral of projections, if no column shows
     air.
 
-    A wrong factor in the intensity adds the same constant to every line integral, as material beyond the field of view
-    may do. For cans of 1.5 to 3 times the width of the field of view, this changes the densities of FBP by 0.4 to 0.8
-    of the relative change of the line integrals, and those of FISTA-TV by 0.9.
+    A wrong factor in the intensity adds the same constant to every line integral. Material beyond the field of view may
+    have the same effect. In cans 1.5 to 3 times as wide as the field of view, the densities of FBP change by 0.4 to 0.8
+    times the relative change of the line integrals, and those of FISTA-TV by 0.9 times.
     """
     flats, views = scan.table.flats, scan.table.views
     more = math.log1p(BRIGHTER_FLATS)
@@ -213,10 +222,10 @@ def without_air(scan: ScanEvidence, mean: float) -> str:
 
 
 def _noise_ratio(scan: ScanEvidence) -> float:
-    """Variance divided by intensity of the flats, over that of the projections; 0 if it is not known.
+    """Variance divided by intensity, for the flats relative to the projections; 0 if it is not known.
 
-    Photon transfer (Janesick 2007): light brings its variance, by one factor for all images of a camera. Structure of
-    the sample adds to the variance of projections, so that their quietest places count.
+    By photon transfer (Janesick 2007), variance divided by intensity is the same in all images of a camera. Structure
+    of the sample adds to the variance of projections, so only their quietest tiles are used.
     """
     views = spread(scan.table.views, VIEWS)
     taken = [np.concatenate(scan.used.darks), spread(max(scan.used.flats, key=len), VIEWS), views]
@@ -235,7 +244,9 @@ def _noise_ratio(scan: ScanEvidence) -> float:
 
 
 def _gain(net: F32, intensity: F32) -> float:
-    """Variance of counts over their number, in the quietest tiles of an image; NaN if there is none."""
+    """Variance of the counts divided by the counts, in the quietest tiles of an image; NaN if there are no such
+    tiles.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         change = np.diff(np.diff(net / intensity, axis=0), axis=1)
         each = np.where(net > 0, intensity**2 / net, np.nan)[1:, 1:] * change**2 / 4
@@ -248,7 +259,9 @@ def _gain(net: F32, intensity: F32) -> float:
 
 
 def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
-    """Darks have the exposure of the projections, or two exposures from which darks of any other follow."""
+    """Darks have the exposure of the projections; or they have two exposures, from which the dark of any other exposure
+    can be computed.
+    """
     if not scan.in_counts:
         return
     usual = scan.usual_exposure
@@ -270,7 +283,7 @@ def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
             f"The projections were exposed for {views.min():g} to {views.max():g} s; the intensity of each is {doubt}",
         )
     darks = darks[darks > 0]
-    if darks.size and np.ptp(darks) <= EXPOSURE_TOLERANCE * usual < np.abs(darks - usual).max():  # of NaN never
+    if darks.size and np.ptp(darks) <= EXPOSURE_TOLERANCE * usual < np.abs(darks - usual).max():  # never true for NaN
         yield Finding(
             "warning",
             "exposures",
@@ -279,14 +292,16 @@ def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
         )
 
 
-# projections looked at; between them: a wide sample differs from farther sides
+# projections that are examined; largest step between them, because a wide sample looks different from other sides
 _IN_A_ROW, _BESIDE = 12, np.radians(20.0)
-_AS_GOOD = 0.8  # of the intensity of the best step, next to its flats: a sample takes as much of others
+# share of the intensity of the best step next to its flats; the sample absorbs the same in the other steps
+_AS_GOOD = 0.8
 
 
 def one_intensity(scan: ScanEvidence) -> Iterator[Finding]:
-    """Consecutive projections have the same intensity, except for a drift; otherwise the finding names the step that
-    selects one of the intensities, with its flats."""
+    """Consecutive projections have the same intensity, except for a drift. Otherwise the finding says with which step
+    one can select the projections of one intensity and their flats.
+    """
     flats, views = scan.table.flats, scan.table.views
     ends = views[:_IN_A_ROW], views[-_IN_A_ROW:]
     if (
@@ -311,7 +326,7 @@ def one_intensity(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def _way_of_steps(scan: ScanEvidence, n: int, most: float) -> str:
-    """Which step through the projections takes one of so many lights, with its flats."""
+    """The step through the projections that selects one of `n` intensities together with its flats."""
     shares = np.array([_share_of_flats(scan, slice(first, None, n), most) for first in range(n)])
     steps = [f"--frames {first}::{n}" for first in range(n) if 0 < shares[first] >= _AS_GOOD * shares.max()]
     if not steps:
@@ -323,7 +338,7 @@ def _way_of_steps(scan: ScanEvidence, n: int, most: float) -> str:
 
 
 def _log_intensities(scan: ScanEvidence, rows: I64) -> F64:
-    """Logarithms of the intensity of frames [frame]."""
+    """[frame] logarithm of the intensity of each frame."""
     darks = scan.table.darks
     dark = scan.mean_cells(darks) if darks.size else 0.0
     intensity = [np.percentile(np.nan_to_num(cells) - dark, BRIGHT) for cells in scan.cells(rows)]
@@ -331,7 +346,9 @@ def _log_intensities(scan: ScanEvidence, rows: I64) -> F64:
 
 
 def _share_of_flats(scan: ScanEvidence, step: slice, most: float) -> float:
-    """Light of the projections of a step over that of its flats; 0 if its flats differ, or are darker."""
+    """Intensity of the projections of a step relative to its flats; 0 if its flats differ from each other, or are
+    darker.
+    """
     table = selected(scan.source, step).table
     flats, views = (_log_intensities(scan, rows[:_IN_A_ROW]) for rows in (table.flats, table.views))
     share = math.exp(np.median(views) - np.median(flats))
@@ -339,7 +356,7 @@ def _share_of_flats(scan: ScanEvidence, step: slice, most: float) -> float:
 
 
 def several_energies(scan: ScanEvidence) -> str:
-    """The energies at which projections were taken, of which a volume requires one."""
+    """All projections were taken at one energy, as a volume requires. Otherwise the finding lists the energies."""
     energies = np.zeros(0) if scan.table.energies is None else scan.table.energies[scan.table.views]
     return "" if len(parts := frames_by_energy(energies)) < 2 else (
         f"The projections were taken at {len(parts)} energies: {in_words(energies)}. A volume needs one "

@@ -1,6 +1,4 @@
-"""Rules on pixel values: whether they are counts, transmission or line integrals as stated, and whether they were
-measured.
-"""
+"""Rules on pixel values: they are counts, transmission or line integrals as stated, and they were measured."""
 
 from __future__ import annotations
 
@@ -20,10 +18,11 @@ from drivers.base.frame import FrameKind
 from recon.base.units import look_like_counts, look_like_transmission
 from recon.base.views import spread
 
-CONSTANT_DARKS = "constant-darks"  # a rule whose finding is no fault, but which `info` shows
-_SURELY_BELOW, _FEW = 0.1, 0.005  # of the range below 0, and of the pixels: no noise of a signed number, nor spots
-_SAMPLES = 4  # frames of a kind that are looked at
-SHAPES = 32  # projections whose shape is looked at
+CONSTANT_DARKS = "constant-darks"  # a rule whose finding is not a fault; `info` shows it
+# shares of the range that lies below 0, and of the pixels below 0; noise and single spots stay below them
+_SURELY_BELOW, _FEW = 0.1, 0.005
+_SAMPLES = 4  # frames of a kind that are examined
+SHAPES = 32  # projections whose shape is examined
 _FALLS = (
     "Give --quantity transmission, which takes the logarithm: the values are about 1 at the edges of the "
     "projections and lower in the sample, like transmission. Line integrals would be 0 at the edges and "
@@ -32,7 +31,9 @@ _FALLS = (
 
 
 def numbers_wrapped(scan: ScanEvidence) -> Iterator[Finding]:
-    """Whole numbers must fit their type: a pixel brighter than its largest value starts again at the smallest."""
+    """Counts must fit into their integer type. A pixel that exceeds the largest value of the type continues at the
+    smallest value.
+    """
     kinds = (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK) if scan.source.dtype.itemsize == 2 else ()
     samples = {kind: images for kind in kinds if (images := sample(scan, kind)) is not None}
     frames, flats = samples.values(), samples.get(FrameKind.FLAT)
@@ -62,8 +63,9 @@ def numbers_wrapped(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def quantity_stated(scan: ScanEvidence) -> Iterator[Finding]:
-    """The quantity of the pixels must be known, because a missing or a second logarithm ruins a volume without any
-    other sign."""
+    """The quantity of the pixels must be known. If the logarithm is missing or applied twice, the volume is wrong, and
+    nothing else shows it.
+    """
     if scan.source.quantity == "unknown":
         note = scan.source.attributes.get("quantity")
         remark = "" if note is None else f"The file has only a remark ({str(note)[:80]!r}). "
@@ -76,7 +78,9 @@ def quantity_stated(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def darks_computed(scan: ScanEvidence) -> str:
-    """Finds darks that were computed, not recorded: in a dark of a camera the pixels have different values."""
+    """Finds darks that were computed and not recorded: in a dark that a camera recorded, pixels have different
+    values.
+    """
     darks = sample(scan, FrameKind.DARK) if scan.source.dtype.kind in "ui" else None
     return "" if darks is None or darks.min() < darks.max() else (
         f"The darks are {darks.min():g} in every pixel checked: a constant, not what the camera measures "
@@ -85,7 +89,7 @@ def darks_computed(scan: ScanEvidence) -> str:
 
 
 def pixels_measured(scan: ScanEvidence) -> Iterator[Finding]:
-    """Projections hold finite numbers that are not all the same."""
+    """Projections contain finite numbers that are not all the same."""
     views = sample(scan, FrameKind.PROJECTION)
     if views is None:
         return
@@ -115,13 +119,15 @@ def pixels_measured(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def _falls(scan: ScanEvidence) -> bool:
-    """The projections look like transmission, which real numbers can be."""
+    """True if the projections are real numbers and look like transmission."""
     views = sample(scan, FrameKind.PROJECTION, SHAPES) if scan.source.dtype.kind == "f" else None
     return views is not None and look_like_transmission(views)
 
 
 def sample(scan: ScanEvidence, kind: FrameKind, count: int = _SAMPLES) -> NDArray[Any] | None:
-    """A few frames of a kind, spread over the scan, at most 256 rows of the middle; None if there is none."""
+    """A few frames of one kind, spread over the scan; only the middle rows, at most 256. None if there is no such
+    frame.
+    """
     rows = scan.table.of_kind(kind)
     if rows.size == 0:
         return None

@@ -1,5 +1,5 @@
-"""Rules for a scan of any format, one function per rule. Validators of other programs accept NaN angles; these rules
-do not.
+"""Rules for a scan of any format, one function per rule. Other programs accept angles that are NaN; these rules do
+not.
 """
 
 from __future__ import annotations
@@ -39,14 +39,16 @@ from beamline.storage.rules.pixels import (
 from beamline.storage.rules.stored_order import axis_vertical, sinogram_assumed, views_first
 from drivers.base.frame import FrameKind
 
-VARYING = "lengths"  # a rule on those that differ from projection to projection
-_JOINED_BLUR = 4.0  # columns at the edge of the field, from frames of one projection
-_OFF_MIDDLE = 0.05  # of the detector: a central ray nearer to its middle is as good as there
+VARYING = "lengths"  # a rule about values that differ between projections
+_JOINED_BLUR = 4.0  # columns at the edge of the field of view, between the frames of one projection
+# share of the detector: if the central ray is nearer to the middle, it counts as being in the middle
+_OFF_MIDDLE = 0.05
 
 
 def scan_ended(scan: ScanEvidence) -> Iterator[Finding]:
-    """The file was closed, and the scan ended as planned; otherwise the finding states what to do, or who ended the
-    scan."""
+    """The file was closed, and the scan ended as planned. Otherwise the finding says what to do, or who ended the
+    scan.
+    """
     ending, n = scan.source.ending, count(len(scan.table), "frame")
     if not scan.source.finished:
         sentence = f"The file was not closed: {n} can be trusted."
@@ -63,7 +65,7 @@ def scan_ended(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def altered_sentence(source: ScanSource) -> str:
-    """Sentences on the rows of a scan whose record differs from its checksum."""
+    """Sentences about the rows of a scan whose record differs from its checksum."""
     rows = np.flatnonzero(source.table.altered).tolist()
     return (
         f"Look for an intact copy of {source.path}: the records of {count(len(rows), 'frame')} (kind, "
@@ -73,7 +75,7 @@ def altered_sentence(source: ScanSource) -> str:
 
 
 def references_present(scan: ScanEvidence) -> Iterator[Finding]:
-    """Scans of counts have darks and flats."""
+    """A scan whose pixels are counts has darks and flats."""
     if "beside" in scan.source.attributes:
         sentence = f"The darks and flats next to the projections are used: {scan.source.attributes['beside']}."
         yield Finding("info", "references", sentence)
@@ -90,7 +92,9 @@ def references_present(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def stated_used(scan: ScanEvidence) -> Iterator[Finding]:
-    """Everything that the file states is used or reported: as a warning if it may change the volume."""
+    """Everything that the file states is used or reported. The report is a warning if the value may change the
+    volume.
+    """
     for field in scan.source.not_used:
         message = f"The file states {field.where}, {field.value}, which is not used: {field.why}."
         severity: Severity = "error" if field.wrong else "warning" if field.doubt else "info"
@@ -100,21 +104,21 @@ def stated_used(scan: ScanEvidence) -> Iterator[Finding]:
 def central_ray_taken(scan: ScanEvidence) -> Iterator[Finding]:
     """In a cone beam, the central ray that the file or the caller states meets the middle row and the rotation axis."""
     ways = ("row", "the middle of the rows", "--central-row"), ("column", "the rotation axis", "--axis")
-    for (side, taken, option), at, n in zip(ways, scan.source.central_ray or (), scan.source.shape, strict=False):
-        if scan.cone is not None and abs(at - (n - 1) / 2) > _OFF_MIDDLE * n:
+    for (side, taken, option), position, n in zip(ways, scan.source.central_ray or (), scan.source.shape, strict=False):
+        if scan.cone is not None and abs(position - (n - 1) / 2) > _OFF_MIDDLE * n:
             yield Finding(
                 "warning",
                 f"central-{side}",
-                f"Give {option} {at:.6g} if the file is right: it states that the central ray meets "
-                f"{side} {at:.6g} (beam_center, from the centre of the first of {n}). The reconstruction "
+                f"Give {option} {position:.6g} if the file is right: it states that the central ray meets "
+                f"{side} {position:.6g} (beam_center, from the centre of the first of {n}). The reconstruction "
                 f"assumes {taken}.",
             )
 
 
 def pixels_square(scan: ScanEvidence) -> Iterator[Finding]:
-    """Pixels are square, or each row is a separate slice."""
+    """Pixels are square, unless each row is a separate slice."""
     width, height = scan.source.pixel_size_mm, scan.source.row_pitch_mm
-    if height is None or width == 0:  # a width of 0 is another rule's
+    if height is None or width == 0:  # another rule checks for a width of 0
         return
     if not width or not 0.01 < height / width < 100:
         width_text = "unknown" if width is None else f"{width:g} mm"
@@ -139,7 +143,7 @@ def pixels_square(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def joined_views(scan: ScanEvidence) -> str:
-    """Frames of one projection that lie so far apart in angle that their mean is blurred."""
+    """Frames that are averaged to one projection are not so far apart in angle that their mean is blurred."""
     degrees = float(scan.source.attributes.get(JOINED_DEG, 0.0))
     blur = np.radians(degrees) * scan.source.shape[1] / 2
     return "" if blur <= _JOINED_BLUR else (
@@ -150,7 +154,7 @@ def joined_views(scan: ScanEvidence) -> str:
 
 
 def parts_joined(scan: ScanEvidence) -> Iterator[Finding]:
-    """The file is not a single part of a resumed scan."""
+    """The file is not a single part of a resumed scan, but contains all parts."""
     if scan.table.part_starts.size > 1:
         return
     if (joined_file := joined_file_of(scan.source.path)) is not None and is_joined(joined_file[0]):
@@ -166,8 +170,9 @@ def parts_joined(scan: ScanEvidence) -> Iterator[Finding]:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table for a rule with a single finding: its condition returns the sentence of the finding, or "" if
-    there is nothing to report."""
+    """A row of the table for a rule with a single finding: the condition returns the sentence of the finding, or "" if
+    there is nothing to report.
+    """
 
     severity: Severity
     rule: str
@@ -228,14 +233,15 @@ RULES: tuple[Rule, ...] = (
     darks_beside_views,
     frames_flagged,
 )  # fmt: skip
-"""All rules on a scan, in the order in which their findings are told by `validate`, `info` and the preparation."""
+"""All rules on a scan, in the order in which `validate`, `info` and the preparation report their findings."""
 BEFORE_VIEWS: tuple[Rule, ...] = (quantity_stated, references_present, numbers_wrapped, references_usable)
-"""Those that a running scan must meet before its views are corrected."""
+"""The rules that a running scan must meet before its projections are corrected."""
 
 
 def findings_of(scan: ScanEvidence, rules: tuple[Rule, ...] = RULES) -> list[Finding]:
-    """The findings of these rules on a scan. If a rule would take too long, a finding states that it was not
-    applied."""
+    """Yields the findings of these rules on a scan. If a rule would take too long, a finding says that it was not
+    applied.
+    """
     findings = list[Finding]()
     for rule in rules:
         try:

@@ -14,11 +14,13 @@ from beamline.storage.rules.pixels import SHAPES
 from recon.base.views import spread
 from recon.prep.unmeasured import with_borders_filled
 
-_TURNED = 12  # projections by which the direction of the axis is found
-_LEAST = 8  # projections, rows and columns: fewer tell nothing of it
-_LEAST_SQUARE = 16  # projections and rows, as many
-_ON_A_SINE, _OFF_A_SINE, _OTHER_MASS = 0.9, 4.0, 4.0  # share of a change; times what is left of it; times a variance
-_HORIZONTAL = 10.0  # of the change of rows over that of columns; real scans have 0.001 to 0.03, turned ones the inverse
+_TURNED = 12  # projections from which the direction of the axis is determined
+_LEAST = 8  # fewest projections, rows and columns from which it can be determined
+_LEAST_SQUARE = 16  # most projections and rows that are used
+# limits: a share of a change; a factor on the remaining change; a factor on a variance
+_ON_A_SINE, _OFF_A_SINE, _OTHER_MASS = 0.9, 4.0, 4.0
+# change of the row sums relative to that of the column sums; real scans have 0.001 to 0.03, rotated images the inverse
+_HORIZONTAL = 10.0
 
 
 def axis_vertical(scan: ScanEvidence) -> Iterator[Finding]:
@@ -40,34 +42,26 @@ def axis_vertical(scan: ScanEvidence) -> Iterator[Finding]:
         )
 
 
-_EXCHANGE = (("angle", "theta"), ("dark", "data_dark"), ("flat", "data_white"))
-
-
 def _exchanged(scan: ScanEvidence) -> str:
-    """How rows and columns of stacks in HDF5 are exchanged, as a sentence; "" for other formats.
+    """A sentence that says how to exchange rows and columns of stacks in HDF5; "" for other formats.
 
-    MATLAB writes dimensions in reverse. A quarter turn would show the mirror image of these.
+    MATLAB writes dimensions in reverse order. Rotating such images by 90 degrees would give their mirror images.
     """
-    data, dimensions = (
-        scan.source.attributes.get("data"),
-        str(scan.source.attributes.get("dimensions", "frame,row,col")),
-    )
-    others = ""
-    if scan.source.format == "data_exchange":
-        data, others = "exchange/data", "".join(f" --{name}s-path exchange/{at}" for name, at in _EXCHANGE)
+    data, others = scan.source.stack_options
+    dimensions = str(scan.source.attributes.get("dimensions", "frame,row,col"))
     order = ",".join({"row": "col", "col": "row"}.get(axis, axis) for axis in dimensions.split(","))
     say = f"If rows and columns are exchanged, as MATLAB writes them, give --data-path {data}:{order}{others}. "
-    return "" if data is None else say
+    return say if data else ""
 
 
 def change_of_rows(depths: NDArray[np.float64]) -> float:
     """Squared change of the row sums of [view, row, col] from projection to projection, relative to that of the column
     sums.
 
-    About 1 if there is only noise. A rotation about the columns moves material along the rows and does not change their
-    sums. A drifting beam also changes the ends of the rows. So does material that leaves a narrow field of view, in
-    proportion to the material in each row. Therefore a parabola over the rows and their mean profile are fitted to the
-    ends and subtracted.
+    The value is about 1 if there is only noise. If the rotation axis is parallel to the columns, the rotation moves
+    material along the rows, and the row sums do not change. Two other effects change the row sums and the ends of the
+    rows: a drifting beam, and material that leaves a narrow field of view, in proportion to the material in each row.
+    Therefore a parabola over the rows and the mean profile of the rows are fitted to the ends and subtracted.
     """
     change = depths - depths.mean(axis=0)
     ends = max(1, depths.shape[2] // 16)
@@ -81,11 +75,10 @@ def change_of_rows(depths: NDArray[np.float64]) -> float:
 
 
 def views_first(scan: ScanEvidence) -> Iterator[Finding]:
-    """If there are as many projections as rows, the first dimension is that of the projections, and the second that of
-    the rows.
+    """If there are as many projections as rows, the first dimension counts the projections and the second one the rows.
 
-    In sinograms it is the other way round: the rows of each image are projections. They have the same total absorption,
-    and their first moments follow a sine of the angle (Helgason 1965; Ludwig 1966). From image to image this is not so.
+    If the images are sinograms, the rows of each image are projections. These have the same total absorption, and their
+    first moments follow a sine of the angle (Helgason 1965; Ludwig 1966). Both are not true for successive images.
     """
     views = scan.table.views
     angles = scan.table.angles[views]
@@ -115,19 +108,17 @@ def views_first(scan: ScanEvidence) -> Iterator[Finding]:
         )
 
 
-SINOGRAM = "sinogram"  # a rule whose finding is no fault, but which `info` and `recon` show
+SINOGRAM = "sinogram"  # a rule whose finding is not a fault; `info` and `recon` show it
 
 
 def sinogram_assumed(scan: ScanEvidence) -> Iterator[Finding]:
-    """States which dimension of an array [view, col] is used as that of the projections, and how to state another
-    order."""
+    """States which dimension of an array [view, col] is used as that of the projections, and how the user can state
+    another order.
+    """
     axes = str(scan.source.attributes.get("dimensions", "")).split(",")
     if sorted(axes) == ["col", "frame"]:
         n = scan.table.views.size
-        first = axes[0] == "frame"
-        option = f"give --order {'col,view' if first else 'view,col'}"
-        if scan.source.format == "data_exchange":
-            option = f"set the attribute axes of /exchange/data to {'x:theta' if first else 'theta:x'}"
+        option = scan.source.exchange_sinogram(views_first=axes[0] == "frame")
         yield Finding(
             "info",
             SINOGRAM,
@@ -137,7 +128,7 @@ def sinogram_assumed(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def _explained(values: NDArray[np.float64], angles: NDArray[np.float64]) -> float:
-    """Share of the change of values [view, of each] that is a sine of the angles [view]."""
+    """The share of the change of values [view, ...] that a sine of the angles [view] explains."""
     parts = np.column_stack([np.ones_like(angles), np.cos(angles), np.sin(angles)])
     rest = values - parts @ np.linalg.lstsq(parts, values, rcond=None)[0]
     change = float(values.var(axis=0).sum())
@@ -145,7 +136,7 @@ def _explained(values: NDArray[np.float64], angles: NDArray[np.float64]) -> floa
 
 
 def _depths(scan: ScanEvidence, views: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Line integrals of some projections [view, row, col], coarse, except for what all projections share."""
+    """Coarse line integrals [view, row, col] of some projections, minus the part that all projections share."""
     block = max(1, min(max(scan.source.shape) // 128, min(scan.source.shape) // _LEAST))
     rows, cols = (n // block for n in scan.source.shape)
     darks = scan.table.darks[:1]
@@ -161,6 +152,6 @@ def _depths(scan: ScanEvidence, views: NDArray[np.int64]) -> NDArray[np.float64]
     depths = np.array(bits).reshape(-1, rows, cols)
     if scan.source.quantity == "line_integrals" or not len(depths):
         return depths
-    if not depths.max() > 0:  # neither counts nor transmission
+    if not depths.max() > 0:  # the pixels are neither counts nor transmission
         return depths[:0]
     return -np.log(np.maximum(depths, 1e-3 * np.max(depths)))

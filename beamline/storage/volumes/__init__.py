@@ -1,4 +1,4 @@
-"""Volume files, by format."""
+"""Formats of volume files."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FormatEntry:
-    """A registry entry of a format of volume files.
+    """An entry in the registry of formats of volume files.
 
     Attributes:
-        suffixes: that a file's name ends in, the usual one first; "" for a folder.
-        note: what help says of it.
+        suffixes: suffixes of the file names, the usual one first; "" for a folder.
+        note: description of the format in help texts.
     """
 
     module: str
@@ -39,10 +39,10 @@ REGISTRY = {
 
 @cache
 def entries() -> Registry[FormatEntry]:
-    """The formats of this package and of other packages, by name."""
+    """The formats of this package and of add-ons, by name."""
     taken = {suffix for entry in REGISTRY.values() for suffix in entry.suffixes}
 
-    def made(name: str, kind: type[Any]) -> FormatEntry:
+    def entry_of(name: str, kind: type[Any]) -> FormatEntry:
         suffixes = tuple(kind().suffixes)
         if not suffixes or taken & set(suffixes) or any(suffix[:1] != "." for suffix in suffixes):
             raise ValueError(
@@ -55,7 +55,7 @@ def entries() -> Registry[FormatEntry]:
         taken.update(suffixes)
         return FormatEntry(kind.__module__, kind.__name__, suffixes)
 
-    return Registry("volume_format", REGISTRY, made)
+    return Registry("volume_format", REGISTRY, entry_of)
 
 
 @cache
@@ -65,7 +65,7 @@ def formats() -> tuple[VolumeFormat, ...]:
 
 
 def suffixes_text() -> str:
-    """The usual suffixes, for help."""
+    """The usual suffixes, for help texts."""
     named = [entry for entry in entries().values() if entry.suffixes[0]]
     folders = [f"or no suffix: {entry.note}" for entry in entries().values() if not entry.suffixes[0]]
     return ", ".join([e.suffixes[0] + (f" ({e.note})" if e.note else "") for e in named] + folders)

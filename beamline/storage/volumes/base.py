@@ -1,4 +1,4 @@
-"""Interface of a volume file format, conversion of voxels to grey values, and the facts stored with them."""
+"""Interface of a format of volume files; conversion of voxels to grey values; metadata of a volume as JSON."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ class Pixels:
 
 
 class Slices:
-    """The slices of a volume in stored form, one by one.
+    """Yields the slices of a volume in the form in which they are stored.
 
-    `outside` counts the voxels, of those passed so far, that the window clipped or that are not finite.
+    `outside` is the number of voxels so far that the window clipped, or that are not finite.
     """
 
     def __init__(self, volume: Volume, pixels: Pixels) -> None:
@@ -79,24 +79,26 @@ class VolumeFormat(Protocol):
 
     @property
     def greys(self) -> bool:
-        """True if the format stores grey values of 8 and 16 bits."""
+        """True if the format can store grey values of 8 and 16 bits."""
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
-        """Write a new file, slice by slice. Raises OSError if the disk refuses."""
+        """Write a new file, slice by slice. Raises OSError if the disk failed."""
 
     def holds(self, path: Path) -> bool:
-        """True if the file is a volume in this format, written by this program; False if it cannot be read."""
+        """True if this program wrote the file as a volume in this format. False also if the file cannot be read."""
 
     def open(self, path: Path) -> AbstractContextManager[ReconRecord]:
-        """The record of such a file; the volume's voxels are read when they are sliced along z.
+        """The record of such a file. Voxels are read when the volume is sliced along z.
 
         Raises:
-            DataError: cut off or damaged.
+            DataError: the file is cut off or damaged.
         """
 
 
 def facts_of(record: ReconRecord, pixels: Pixels) -> dict[str, Any]:
-    """Metadata of a volume as JSON, for formats without fields for them: all but arrays and the history."""
+    """Metadata of a volume as JSON, for formats that have no fields for them. Arrays and the history are not
+    included.
+    """
     grid = record.volume.grid
     return {
         "format": VOLUME,
@@ -117,7 +119,7 @@ def facts_of(record: ReconRecord, pixels: Pixels) -> dict[str, Any]:
 
 
 def marked(text: str) -> dict[str, Any] | None:
-    """The metadata in a description; None if another program wrote it."""
+    """The metadata in a description; None if another program wrote the description."""
     if VOLUME not in text:
         return None
     try:
@@ -128,10 +130,11 @@ def marked(text: str) -> dict[str, Any] | None:
 
 
 def record_of(path: Path, facts: Mapping[str, Any], values: Any) -> ReconRecord:
-    """The record with the metadata of `facts_of` and the values [z, y, x]; a grey window is among its parameters.
+    """The record with the metadata from `facts_of` and the values [z, y, x]. If voxels are grey values, the parameters
+    contain their window.
 
     Raises:
-        DataError: the metadata were changed by another program.
+        DataError: another program changed the metadata.
     """
     try:
         z, y, x = map(float, facts["centre_zyx"])
@@ -157,7 +160,7 @@ def record_of(path: Path, facts: Mapping[str, Any], values: Any) -> ReconRecord:
 
 
 def bare_record(path: Path, values: Any, spacing: tuple[float, float, float] | None = None) -> ReconRecord:
-    """The record of a volume without other metadata; `spacing` (z, y, x) in mm."""
+    """The record of a volume that has no metadata. `spacing` is (z, y, x) in mm."""
     dz, dy, dx = spacing or (1.0, 1.0, 1.0)
     if 0 in values.shape:
         raise DataError(f"{path} has no voxels: its shape is {values.shape}; expected [z, y, x].")

@@ -1,6 +1,4 @@
-"""Formats of volume files, chosen by the suffix of the name: writes a volume as a whole, and opens one slice by
-slice.
-"""
+"""Writes a volume in the format that the suffix of the file name selects, and opens volume files slice by slice."""
 
 from __future__ import annotations
 
@@ -43,7 +41,7 @@ from recon.base.volume import Volume
 
 @dataclass(frozen=True)
 class NXtomoproc:
-    """HDF5, float32, with all settings, figures of merit and the history."""
+    """HDF5 with float32 voxels, all settings, figures of merit and the history."""
 
     name: str = "HDF5 (NXtomoproc)"
     suffixes: tuple[str, ...] = REGISTRY["hdf5"].suffixes
@@ -68,8 +66,9 @@ class NXtomoproc:
 
 @dataclass(frozen=True)
 class NexusVolume:
-    """HDF5 whose default plot has the axes z, y, x: a reference volume of `simulate`, labels of `structure`; only
-    read."""
+    """HDF5 whose default plot has the axes z, y, x: a ground truth of `simulate`, or labels of `structure`. This format
+    is only read.
+    """
 
     name: str = "HDF5 (NXdata)"
     suffixes: tuple[str, ...] = ()
@@ -103,7 +102,9 @@ class NexusVolume:
 
 
 def _plotted(file: h5py.File) -> h5py.Dataset | None:
-    """The volume [z, y, x] that the file's attributes `default` and `signal` name; None without one."""
+    """The volume [z, y, x] to which the attributes `default` and `signal` of the file lead; None if there is no such
+    volume.
+    """
     entry = datasets.resolve(file, datasets.attribute(file, "default") or "entry")
     data = (
         datasets.resolve(entry, datasets.attribute(entry, "default") or "data")
@@ -127,7 +128,9 @@ _KEY = b"splatline:="
 
 @dataclass(frozen=True)
 class Nrrd:
-    """NRRD 4 (teem.sourceforge.net/nrrd/format.html), raw, attached header; the facts are JSON under `splatline`."""
+    """NRRD 4 (teem.sourceforge.net/nrrd/format.html), raw, with an attached header. The metadata are JSON under
+    `splatline`.
+    """
 
     name: str = "NRRD"
     suffixes: tuple[str, ...] = REGISTRY["nrrd"].suffixes
@@ -145,7 +148,7 @@ class Nrrd:
             f"encoding: raw\n{units}space origin: ({x!r},{y!r},{z!r})\n"
         ).encode("ascii")
         with path.open("xb") as file:
-            escaped = facts.replace("\\", "\\\\")  # JSON has no line ends, which NRRD would escape, too
+            escaped = facts.replace("\\", "\\\\")  # JSON contains no line ends, which NRRD would have to escape
             file.write(header + _KEY + escaped.encode("ascii") + b"\n\n")
             for values in slices:
                 file.write(values.data)
@@ -188,7 +191,7 @@ class Npy:
                 file.write(values.data)
 
     def holds(self, path: Path) -> bool:
-        """True if the file has three axes of numbers."""
+        """True if the file is an array of numbers with three axes."""
         if not (path.name.lower().endswith(self.suffixes) and path.is_file()):
             return False
         try:
@@ -204,7 +207,7 @@ class Npy:
 
 
 def _header(path: Path) -> tuple[bytes, int]:
-    """The header of an NRRD, and where its data begin; (b"", 0) if it has none."""
+    """The header of an NRRD, and the position at which its data begin; (b"", 0) if the file has no header."""
     with path.open("rb") as file:
         head = file.read(_LONGEST_HEADER)
     end = head.find(b"\n\n")
@@ -215,7 +218,7 @@ def format_of(path: Path) -> VolumeFormat:
     """The format of a file name, by its suffix.
 
     Raises:
-        ValueError: for none; the message lists those that there are.
+        ValueError: no format has this suffix; the message lists the suffixes of all formats.
     """
     suffix = path.suffix.lower()
     if not path.name or (not suffix and path.name.startswith(".")):
@@ -237,18 +240,18 @@ def format_of(path: Path) -> VolumeFormat:
 
 
 def write_volume(path: Path, record: ReconRecord, pixels: Pixels | None = None, *, replace: bool = False) -> int:
-    """Write a volume in the format of the suffix of `path`, slice by slice; on an error no file remains.
+    """Write a volume, slice by slice, in the format that the suffix of `path` selects. After an error no file remains.
 
     Args:
-        pixels: default: float32.
-        replace: a file takes the place of an older one; a folder never does.
+        pixels: how voxels are stored; default: float32.
+        replace: True: a file may replace an older file. A folder never replaces an older one.
 
     Returns:
-        how many voxels the window clipped.
+        the number of voxels that the window clipped.
 
     Raises:
-        ValueError: an unknown suffix, or grey values in a format without.
-        DataError: `path` exists and `replace` is not set, or the disk refuses; nothing is left.
+        ValueError: the suffix is unknown, or the format cannot store grey values.
+        DataError: `path` exists and `replace` is False, or the disk failed. No new file is left.
     """
     kind, pixels = format_of(path), pixels or Pixels()
     if record.series is not None:
@@ -266,11 +269,11 @@ def write_volume(path: Path, record: ReconRecord, pixels: Pixels | None = None, 
 
 
 def volume_format(path: Path) -> VolumeFormat | None:
-    """The format of a volume that this program wrote, of an .npy that is no scan, or of a NeXus file with a volume as
-    its plot; None for other files.
+    """The format of a file that is a volume: written by this program, or an .npy that is not a scan, or a NeXus file
+    whose default plot is a volume. None for other files.
     """
     kind_of_file = next((kind for kind in (*formats(), NexusVolume()) if kind.holds(path)), None)
-    # Voxels alone say nothing of where they come from: a reader of scans goes first.
+    # Voxels alone do not show their origin, so the readers of scans are asked first.
     if isinstance(kind_of_file, Npy) and any(scan.recognises(path, Opening()) for scan in SCANS):
         return None
     return kind_of_file
@@ -279,10 +282,11 @@ def volume_format(path: Path) -> VolumeFormat | None:
 def whole_volume(
     path: Path, dataset: str | None = None
 ) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:
-    """`read_volume`, also for every format that this program writes, with the voxel size that the file states.
+    """Read a volume as `read_volume` does, but also from every format that this program writes. Also returns the voxel
+    size that the file states.
 
     Raises:
-        DataError: as `opened_volume`.
+        DataError: as for `opened_volume`.
     """
     kind = None if dataset is not None else volume_format(path)
     if kind is None or isinstance(kind, NXtomoproc | Npy):
@@ -302,14 +306,14 @@ def times_of(path: Path) -> tuple[float, ...]:
 
 @contextmanager
 def opened_volume(path: Path, dataset: str | None = None, at: int | None = None) -> Iterator[ReconRecord]:
-    """Open any volume file: one of this program is read when it is sliced along z, others are read wholly (see
-    `read_volume`).
+    """Open a volume file of any format. A volume of this program is read when it is sliced along z. Other files are
+    read completely (see `read_volume`).
 
     Args:
-        at: number of one of several volumes in time.
+        at: index of the volume, if the file contains a time series.
 
     Raises:
-        DataError: it cannot be read, or holds no volume.
+        DataError: the file cannot be read, or it does not contain a volume.
     """
     if at is not None:
         with opened_reconstruction(path, at) as record:

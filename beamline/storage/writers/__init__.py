@@ -1,1 +1,1 @@
-"""Writers: scan files, reconstruction files, checkpoints."""
+"""Writers of scan files, reconstruction files and checkpoints."""

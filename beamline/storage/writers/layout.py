@@ -21,10 +21,11 @@ frame and only grow afterwards.
                                 after each pass: pass_ends, decisions
     /exchange                   the same frames as Data Exchange (virtual datasets, put into the group at the end)
 
-image_key holds 0, 1, 2, 3; an alignment frame is 3 there, and -1 in frame_log/kind. image_key_control (a link to it),
-field_of_view and the entry's attributes `definition` and `version` are ESRF's extensions of NXtomo. Without them its
-programs (nabu) take a file for one of another kind, or leave out its darks and flats. Float frames are no NXtomo (its
-data are NX_INT): they get the same paths under the definition FLOAT_DEFINITION.
+image_key contains 0, 1, 2 or 3. An alignment frame has 3 in image_key, and -1 in frame_log/kind. image_key_control (a
+link to frame_log/kind), field_of_view, and the attributes `definition` and `version` of the entry are ESRF's extensions
+of NXtomo. Without them ESRF's programs (nabu) take the file for another kind of file, or leave out its darks and flats.
+NXtomo allows only integers (NX_INT) as data. Frames of real numbers therefore get the same paths under another
+definition, FLOAT_DEFINITION.
 """
 
 from __future__ import annotations
@@ -48,12 +49,14 @@ from beamline.storage.hdf5 import COMMITTED as COMMITTED
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 
-# Not "latest": that writes datatypes that HDF5 1.14 cannot open.
-# the oldest that can do SWMR and virtual datasets: HDF5 1.10 readers open this program's files
+# Not "latest", because that writes datatypes that HDF5 1.14 cannot open. This is the oldest version with SWMR and
+# virtual datasets, so readers with HDF5 1.10 can open the files of this program.
 LIBVER = ("v110", "v110")
 NXTOMO = "NXtomo"
 FLOAT_DEFINITION = "splatline_float_projections"
-ESRF_VERSION = 1.5  # Version of the paths that nxtomo, tomoscan and nabu look for; 1.5 is the oldest with all of ours
+# version of the paths that nxtomo, tomoscan and nabu look for; 1.5 is the oldest version that has all paths of this
+# program
+ESRF_VERSION = 1.5
 
 ENTRY = "/entry"
 DETECTOR = "/entry/instrument/detector"
@@ -63,7 +66,7 @@ IMAGE_KEY_CONTROL = f"{DETECTOR}/image_key_control"
 FIELD_OF_VIEW = f"{DETECTOR}/field_of_view"
 ANGLE = "/entry/sample/rotation_angle"
 KIND = "/entry/frame_log/kind"
-X_TRANSLATION = "/entry/sample/x_translation"  # `Frame.aside`; only of scans with offset projections
+X_TRANSLATION = "/entry/sample/x_translation"  # the value of `Frame.aside`; only for scans with offset projections
 PREVIEW = "/entry/digest/preview"
 COUNT_TIME = f"{DETECTOR}/count_time"
 TRIGGER = "/entry/frame_log/trigger"
@@ -75,8 +78,9 @@ FINISHED = "/entry/progress/finished"
 STATUS = "/entry/progress/status"
 MISSING = "/entry/progress/missing_triggers"
 REASON = "/entry/progress/reason"
-PASS_ENDS = "/entry/progress/pass_ends"  # rows; only of scans that decide what is measured after a pass
-DECISIONS = "/entry/progress/decisions"  # of such scans: a line of JSON each, the values of the event `next_chosen`
+PASS_ENDS = "/entry/progress/pass_ends"  # rows; only for scans that decide after each pass what to measure next
+# only for these scans: one line of JSON per pass, the values of the event `next_chosen`
+DECISIONS = "/entry/progress/decisions"
 PART_STARTS = "/entry/record/part_starts"
 EXCHANGE = "/exchange"
 PARTS = "/entry/record/parts"
@@ -85,14 +89,15 @@ BEAM = "/entry/record/beam"
 BEAM_TIME, BEAM_VALUE = f"{BEAM}/time", f"{BEAM}/value"
 AXIS_COL = "/entry/record/axis_col"
 SOURCE_DISTANCE = "/entry/record/source_distance"
-"""Only in the files of a cone beam. NXsource has a distance too, but synchrotrons state it for beams that nobody takes
-for cones."""
+"""Only in files of a cone beam. NXsource also has a distance, but synchrotrons state it although their beams are
+practically parallel.
+"""
 
-_SCALARS_PER_CHUNK = 512  # 4 KiB: the least that a flush writes for each column
-_MARKS_PER_CHUNK = 32  # frames, of scores and regions
+_SCALARS_PER_CHUNK = 512  # 4 KiB, the smallest amount that a flush writes for each column
+_MARKS_PER_CHUNK = 32  # frames per chunk of the scores and regions
 REASON_BYTES = 600
 FULL = "Full"
-_TURN_TOLERANCE = np.radians(1.0)  # by which 360 degrees may be short
+_TURN_TOLERANCE = np.radians(1.0)  # largest amount that may be missing from 360 degrees
 
 COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {  # path: (type, unit)
@@ -120,14 +125,14 @@ COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
 
 
 def growing(file: h5py.File) -> list[str]:
-    """The datasets with a row for each frame in this file, apart from the pixels and their preview."""
+    """The datasets in this file that have a row for each frame, except the pixels and their preview."""
     return [*COLUMNS, VALID, SCORES, REGIONS, *(path for path in (X_TRANSLATION,) if path in file)]
 
 
 RECORDED = (
     IMAGE_KEY, COUNT_TIME, ANGLE, KIND, TRIGGER, FRAMESTAMP, TIME, REPLACES,
 )  # fmt: skip
-"""Metadata of a frame that never change: RECORD_CHECKSUM is over these columns, in this order."""
+"""Metadata of a frame that never change. RECORD_CHECKSUM is computed from these columns, in this order."""
 
 Description = Mapping[str, str | int | float]
 
@@ -137,21 +142,23 @@ class ScanInfo:
     """Metadata of a scan before its first frame; None if unknown.
 
     Attributes:
-        sample: name; title: one line for people.
-        pixel_size_mm: at the sample; energy_kev; distance_mm: sample to detector.
-        exposure, period: s.
-        axis_col: rotation axis in 0-based pixel-centre columns.
-        source_distance_mm: source to sample; given only for a cone beam (then `pixel_size_mm` is that on the detector,
-            as in NXtomo).
-        plan: JSON; config: YAML; both as text for the record.
+        sample: name of the sample. title: one line for people.
+        pixel_size_mm: pixel size at the sample. energy_kev: photon energy. distance_mm: distance from the sample to the
+            detector.
+        exposure, period: exposure, and time between triggers, in s.
+        axis_col: column of the rotation axis, counted from 0 at the centre of the first column.
+        source_distance_mm: distance from the source to the sample; only for a cone beam (`pixel_size_mm` is then the
+            size on the detector, as in NXtomo).
+        plan, config: the plan as JSON and the configuration as YAML, stored as text.
         devices: the description of each device, by its name.
-        filter: its place, by name.
-        monochromator_kev: its present energy; `energy_kev` is then the same. None: there is none, or it is not known.
-        beam_unit: of the beam monitor's readings; None: there is none.
-        saturation: the count from which a pixel is saturated.
-        offset_views: True if some are planned.
-        decides: True if what is measured next is chosen after each pass.
-        diameter_mm: of the sample.
+        filter: name of the filter that is in the beam.
+        monochromator_kev: present energy of the monochromator; `energy_kev` is then the same. None: there is no
+            monochromator, or its energy is not known.
+        beam_unit: unit of the readings of the beam monitor; None: there is no beam monitor.
+        saturation: counts at which a pixel is saturated.
+        offset_views: True if offset projections are planned.
+        decides: True if the scan decides after each pass what to measure next.
+        diameter_mm: diameter of the sample.
     """
 
     sample: str
@@ -190,7 +197,7 @@ def create(
     preview_bin: int,
     start: float | None,
 ) -> None:
-    """Create every group, dataset and attribute that the file has while it grows, without any frame."""
+    """Create every group, dataset and attribute that the file has while it grows. No frame is stored yet."""
     rows, cols = frame_shape
     definition = NXTOMO if dtype.kind in "iu" else FLOAT_DEFINITION
     _groups(file)
@@ -205,7 +212,7 @@ def create(
     file[ENTRY].attrs["definition"], file[ENTRY].attrs["version"] = definition, ESRF_VERSION
     file[IMAGE_KEY_CONTROL] = file[KIND]
     field = _field_of_view(_planned_angles(info), frame_shape, info.axis_col)
-    if field or info.axis_col is not None:  # what is taken will say it; nothing can be created then
+    if field or info.axis_col is not None:  # readings will state it later, but nothing can be created then
         _rewritable_text(file, FIELD_OF_VIEW, field or FULL, len(FULL))
 
     file[COMMITTED] = np.int64(0)
@@ -220,7 +227,7 @@ def create(
 
 
 def _groups(file: h5py.File) -> None:
-    """The groups that every scan has."""
+    """Create the groups that every scan has."""
     for path, kind in (
         (ENTRY, "NXentry"),
         ("/entry/instrument", "NXinstrument"),
@@ -243,7 +250,7 @@ def _groups(file: h5py.File) -> None:
 
 
 def _facts(file: h5py.File, info: ScanInfo) -> None:
-    """What is known before the first frame: of the sample, the beam, the plan and the devices."""
+    """Write the facts that are known before the first frame: about the sample, the beam, the plan and the devices."""
     file["/entry/title"] = info.title or info.sample
     file["/entry/sample/name"] = info.sample
     file["/entry/instrument/source/probe"] = "x-ray"
@@ -285,7 +292,7 @@ def _facts(file: h5py.File, info: ScanInfo) -> None:
 def _columns(
     file: h5py.File, info: ScanInfo, frame_shape: tuple[int, int], dtype: np.dtype[Any], preview_bin: int
 ) -> None:
-    """All that grows with the frames, or with the readings of the beam."""
+    """Create the datasets that grow with the frames or with the readings of the beam monitor."""
     _growing(file, DATA, frame_shape, dtype)
     _growing(file, PREVIEW, preview_shape(frame_shape, preview_bin), np.dtype("<f4"))
     file[PREVIEW].attrs["bin"] = np.int64(preview_bin)
@@ -308,7 +315,7 @@ def _columns(
 
 
 def state_field_of_view(file: h5py.File) -> None:
-    """Write whether each projection of 360 degrees saw only half of the sample, as far as the projections tell."""
+    """Write whether each projection of a 360-degree scan shows only half of the sample, as far as this is known."""
     field = field_of_view(file)
     if field and FIELD_OF_VIEW in file:
         file[FIELD_OF_VIEW][()] = field.encode()
@@ -317,7 +324,9 @@ def state_field_of_view(file: h5py.File) -> None:
 
 
 def field_of_view(file: h5py.File) -> str:
-    """`Half` if each projection of 360 degrees saw only half of the sample; "" if angles or the axis are unknown."""
+    """`Half` if each projection of a 360-degree scan shows only half of the sample; "" if the angles or the axis are
+    unknown.
+    """
     angles = np.radians(file[ANGLE][()][file[KIND][()] == FrameKind.PROJECTION])
     axis_col = float(file[AXIS_COL][()]) if AXIS_COL in file else None
     return _field_of_view(angles, file[DATA].shape[1:], axis_col)
@@ -327,12 +336,14 @@ def _planned_angles(info: ScanInfo) -> NDArray[np.float64]:
     """Angles of the planned projections, in radians; unknown if the plan does not state them."""
     try:
         return np.radians(np.asarray(json.loads(info.plan)["angles_deg"], np.float64))
-    except (ValueError, LookupError, TypeError):  # a plan of another program, or none
+    except (ValueError, LookupError, TypeError):  # the plan of another program, or no plan
         return np.array([np.nan])
 
 
 def _field_of_view(angles: NDArray[np.float64], frame_shape: tuple[int, ...], axis_col: float | None) -> str:
-    """`Half` if a 360-degree scan shows half of the sample at a time; "" if angles or the axis are not known."""
+    """`Half` if each projection of a 360-degree scan shows only half of the sample; "" if the angles or the axis are
+    unknown.
+    """
     if not np.isfinite(angles).all():
         return ""
     if angles.size < 2 or np.ptp(angles) * angles.size / (angles.size - 1) < 2 * np.pi - _TURN_TOLERANCE:
@@ -344,7 +355,9 @@ def _field_of_view(angles: NDArray[np.float64], frame_shape: tuple[int, ...], ax
 
 
 def _rewritable_text(file: h5py.File, path: str, value: str, width: int) -> None:
-    """Text of fixed length: variable-length text that is written under SWMR cannot be read (h5py issue 1273)."""
+    """Text with a fixed length, because text with a variable length cannot be read if it is written under SWMR (h5py
+    issue 1273).
+    """
     file.create_dataset(path, data=value.encode(), dtype=h5py.string_dtype("utf-8", width))
 
 
@@ -358,7 +371,7 @@ def _nxdata(file: h5py.File, rows: int, cols: int, pixel_size_mm: float | None) 
     group.attrs["signal"] = "data"
     group.attrs["axes"] = ["rotation_angle", "y", "x"]
     for path in (DATA, ANGLE, IMAGE_KEY):
-        file[path].attrs["target"] = path  # NeXus: a link is a link by the target that it names
+        file[path].attrs["target"] = path  # NeXus recognises a link by its attribute `target`
         group[path.rsplit("/", 1)[1]] = file[path]
     for name, n in (("y", rows), ("x", cols)):
         group[name] = np.arange(n) * (1.0 if pixel_size_mm is None else pixel_size_mm)

@@ -1,8 +1,8 @@
-"""NXtomoWriter: writes the file of a scan so that a reader can trust it after every frame.
+"""NXtomoWriter: writes the file of a scan so that the file is valid after every frame.
 
-The file is written SWMR (single writer, multiple readers). Others can read flushed frames at once, and these survive
-the death of this process. Every second they are brought to the disk (fsync), where they survive a loss of power.
-`frames_committed` is advanced last, so that it never counts half a row.
+The file is written SWMR (single writer, multiple readers). Other programs can read flushed frames at once, and flushed
+frames survive if this process is killed. Every second an fsync brings them to the disk, where they also survive a loss
+of power. `frames_committed` is increased last, so that it never counts an incomplete row.
 """
 
 from __future__ import annotations
@@ -48,16 +48,18 @@ LAST = (
     layout.STATUS, layout.FINISHED, layout.END_TIME, layout.FIELD_OF_VIEW, layout.MISSING, layout.REASON,
     layout.BEAM_TIME, layout.BEAM_VALUE, layout.PASS_ENDS, layout.DECISIONS,
 )  # fmt: skip
-"""Datasets that are written when a scan, or a pass of it, ends."""
-FAILURES = (OSError, RuntimeError, ValueError)  # what h5py makes of HDF5's errors
+"""Datasets that are written at the end of a scan, or of a pass."""
+FAILURES = (OSError, RuntimeError, ValueError)  # the classes of errors to which h5py converts errors of HDF5
 
 
 class _TouchedError(OSError):
-    """Another program has cut or deleted the file while it was written."""
+    """Another program truncated or deleted the file while it was being written."""
 
 
 def _new_file(path: Path) -> h5py.File:
-    """DataError if the file exists or HDF5 cannot make it; nothing is left of it then."""
+    """Create a new file. Raises DataError if the file exists or HDF5 cannot create it. An incomplete file is
+    deleted.
+    """
     try:
         return h5py.File(path, "x", libver=layout.LIBVER)
     except FileExistsError as error:
@@ -65,7 +67,7 @@ def _new_file(path: Path) -> h5py.File:
             f"{path} exists, and a scan never overwrites a file. Give another name. Nothing was written."
         ) from error
     except OSError as error:
-        with suppress(OSError):  # made by HDF5, which then failed; one that was there is a FileExistsError
+        with suppress(OSError):  # HDF5 created it and then failed; a file that existed before raises FileExistsError
             path.unlink()
         if lock_failure(error) is LockFailure.NO_LOCKS:
             why = no_locks_sentence(path.parent, error.errno)
@@ -77,8 +79,8 @@ def _new_file(path: Path) -> h5py.File:
 class NXtomoWriter:
     """Writes uint16 frames row by row; never overwrites a file.
 
-    Every append leaves pixels, digest and record of the frame in the file before `frames_committed` counts it.
-    Attribute `remarks`: steps that close() could not do although the data are safe, one sentence each.
+    Each append writes the pixels, the digest and the record of a frame before `frames_committed` counts the frame.
+    Attribute `remarks`: one sentence for each step that failed in close() although the data are safe.
     """
 
     def __init__(
@@ -91,11 +93,11 @@ class NXtomoWriter:
         preview_bin: int = 4,
         flush_every: int = 1,
     ) -> None:
-        """Create the file, ready to be followed.
+        """Create the file. Other programs can then follow it.
 
         Args:
-            preview_bin: the bin that the digests' previews are made with.
-            flush_every: frames between flushes; a crash loses at most the frames since the last one.
+            preview_bin: binning factor of the previews in the digests.
+            flush_every: number of frames between flushes. A crash loses at most the frames since the last flush.
 
         DataError if the file exists or cannot be made.
         """
@@ -119,9 +121,9 @@ class NXtomoWriter:
                 preview_bin=preview_bin,
                 start=clock.now(),
             )
-            self._file.swmr_mode = True  # from here on nothing may be created: Rows can only grow what it holds
+            self._file.swmr_mode = True  # from now on no object may be created: Rows can only extend existing datasets
             self._lock = WriterLock(self.path)
-        except BaseException as error:  # without a frame in it, it is no use to anybody
+        except BaseException as error:  # an empty file is of no use
             with suppress(*FAILURES):
                 self._file.close()
             self.path.unlink()
@@ -134,14 +136,15 @@ class NXtomoWriter:
         self._handle: int = self._file.id.get_vfd_handle()
         self._to_disk, self._before = ToDisk(self._handle), os.fstat(self._handle)
         self._progress = self._file[layout.COMMITTED]
-        # Open to the end: where the disk fails, to let go of a dataset would be to write it once more.
+        # Kept open until the end: if the disk fails, closing a dataset would write to it again.
         self._last: dict[str, h5py.Dataset] = {path: self._file[path] for path in LAST if path in self._file}
 
     def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None:
-        """Write the next row; `frame.index` must be `rows`. `flags`: findings of the monitor, also for earlier rows.
+        """Write the next row; `frame.index` must be `rows`. `flags`: flags of the monitor, for this row or for earlier
+        rows.
 
-        DataError for a wrong shape, type or index; nothing is written then. Also if the disk does not accept the frame;
-        the earlier frames stay readable, and nothing more can be appended.
+        Raises DataError for a wrong shape, type or index; nothing is written then. Also raises DataError if the disk
+        failed. Earlier frames then stay readable, and no more frames can be appended.
         """
         self._check(frame, digest)
         try:
@@ -156,13 +159,13 @@ class NXtomoWriter:
                 self.flush()
         except FAILURES as error:
             with suppress(*FAILURES):
-                self.flush()  # the rows before may still fit
+                self.flush()  # flags of earlier rows may still be written
             self._broken = True
             raise self._disk_error("store the frame in", error) from error
 
     @property
     def rows(self) -> int:
-        """Number of frames appended."""
+        """Number of appended frames."""
         return self._rows
 
     @property
@@ -173,13 +176,13 @@ class NXtomoWriter:
 
     @property
     def safe(self) -> int:
-        """Committed frames that are known to be on the disk: after a failed fsync, all since the last successful one
-        may be lost.
+        """Number of committed frames that are known to be on the disk. After a failed fsync, all frames since the last
+        successful fsync may be lost.
         """
         return self._to_disk.rows if self._to_disk.failed else self._committed
 
     def flush(self) -> None:
-        """Commit the rows so far, regardless of `flush_every`; does nothing after a failed write."""
+        """Commit all rows so far, regardless of `flush_every`. Does nothing after a failed write."""
         if self._broken:
             return
         self._require_untouched()
@@ -191,14 +194,16 @@ class NXtomoWriter:
         self._to_disk(self._committed)
 
     def end_pass(self) -> None:
-        """Record that a pass ends with the rows so far, in a file made for it (ScanInfo.decides).
+        """Record that a pass ends with the last row. The file must have been created with ScanInfo.decides.
 
-        DataError for a disk that does not take it, as of `append`.
+        Raises DataError if the disk failed, with the same effect as in `append`.
         """
         self._append_last(layout.PASS_ENDS, self._rows, "the end of a pass")
 
     def add_decision(self, values: Mapping[str, object]) -> None:
-        """Record what was chosen after a pass, in a file made for it (ScanInfo.decides); errors as in `end_pass`."""
+        """Record the choice after a pass. The file must have been created with ScanInfo.decides. Raises the same errors
+        as `end_pass`.
+        """
         self._append_last(layout.DECISIONS, json_of(values).encode(), "a decision")
 
     def _append_last(self, path: str, value: int | bytes, what: str) -> None:
@@ -220,16 +225,16 @@ class NXtomoWriter:
         beam: Sequence[BeamReading] = (),
         reason: str = "",
     ) -> None:
-        """Finish the file: how and when the scan ended, then `finished`, then the /exchange view. A second call does
-        nothing.
+        """Finish the file: write how and when the scan ended, then `finished`, then the /exchange view. A second call
+        does nothing.
 
-        After a failed write the file only gets status "failed" and `finished`, and keeps the mark of a writer.
+        After a failed write, the file only gets the status "failed" and `finished`. It stays marked as being written.
 
         Args:
             status, missing, reason: see ScanEnding.
-            beam: readings of the beam monitor; kept where the file was made for them (ScanInfo.beam_unit).
+            beam: readings of the beam monitor; written if the file was created with ScanInfo.beam_unit.
 
-        DataError if the disk does not take it; the frames committed stay readable.
+        Raises DataError if the disk failed. Committed frames stay readable.
         """
         if status not in STATUSES:
             raise ValueError(f"Status {status!r} is unknown; expected {', '.join(STATUSES)}.")
@@ -282,11 +287,12 @@ class NXtomoWriter:
         try:
             self._file.close()
         except FAILURES:
-            self._broken = True  # HDF5 has closed it by half: to touch it again would be a crash
+            self._broken = True  # HDF5 has closed half of the file; using it again would crash
             raise
 
     def _let_go(self, reason: str) -> None:
-        """Mark the end where space was already reserved for it, and leave the rest as a killed process would.
+        """Write the mark of the end into space that already exists in the file. Leave everything else as a killed
+        process would leave it.
 
         Readers see every committed frame.
         """
@@ -295,15 +301,17 @@ class NXtomoWriter:
             self._last[layout.FINISHED][()] = 1
             for path in (layout.REASON, layout.STATUS, layout.FINISHED):
                 self._last[path].flush()
-        finally:  # HDF5 would write once more what the disk did not take, now and at the end of the process
+        finally:  # otherwise HDF5 would write again what the disk rejected, now and at the end of the process
             with Path(os.devnull).open("r+b") as nowhere, suppress(*FAILURES):
                 os.dup2(nowhere.fileno(), self._handle)
                 self._file.close()
 
     def _require_untouched(self) -> None:
-        """Raise OSError if another program has cut the file or deleted it: HDF5 would write on, into a hole."""
+        """Raise OSError if another program has truncated or deleted the file. HDF5 would not notice, and would continue
+        to write.
+        """
         now = os.fstat(self._handle)
-        if now.st_nlink == 0 < self._before.st_nlink:  # if there are links at all
+        if now.st_nlink == 0 < self._before.st_nlink:  # if the file system supports hard links
             raise _TouchedError(errno.ENOENT, "it was deleted")
         if now.st_size < self._before.st_size:
             raise _TouchedError(errno.EIO, f"it was cut from {self._before.st_size} to {now.st_size} bytes")
@@ -331,7 +339,7 @@ class NXtomoWriter:
                 "recover` on the copy, and repeat the scan."
             )
         free = ""
-        with suppress(OSError):  # the folder may have moved
+        with suppress(OSError):  # the folder may have been moved
             free = f"; {size(shutil.disk_usage(self.path.parent).free)} are free on its disk"
         return DataError(
             f"Could not {what} {self.path} ({hdf5.reason(error)}){free}. The first {self.safe} frames are "
@@ -339,10 +347,11 @@ class NXtomoWriter:
         )
 
     def _put_exchange_view(self) -> None:
-        """Add the /exchange view. This is impossible while writing SWMR, because it creates datasets; no frame depends
-        on it.
+        """Add the /exchange view. This is not possible while writing with SWMR, because it creates datasets. No frame
+        depends on the view.
         """
-        if hdf5.grows_here(self.path):  # where h5py has it open, HDF5 would cut the view off when that is closed
+        # if h5py still had the file open, HDF5 would remove the view again when it closes the file
+        if hdf5.grows_here(self.path):
             self.remarks.append(
                 f"{self.path} has no /exchange view, because this program has the file open with h5py. "
                 "Close it there; then `beamline recover` adds the view."

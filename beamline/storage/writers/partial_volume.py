@@ -1,8 +1,8 @@
-"""Partial volumes: the finished slabs of a volume, in a file that stays readable even if the process is killed.
+"""Partial volumes: the finished slabs of a volume, in a file that is readable even if the process is killed.
 
-The file is an NXtomoproc file whose space is completely allocated when it is created. Voxels are written through memory
-maps, so that its structure never changes. While a slab is added, slices that it shares with another slab are saved
-separately. If a slab was added only in part, it is removed when the file is opened again.
+The file is an NXtomoproc file whose space is completely allocated when the file is created. Voxels are written through
+memory maps, so the structure of the file never changes. While a slab is added, the slices that it shares with another
+slab are saved separately. If a slab was added only in part, it is removed when the file is opened again.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class PartialVolume:
     """A volume of which some slabs are finished; no other process can add slabs while this object exists.
 
     Attributes:
-        slabs: all of them.
-        made_from: data and settings, by name; the slabs to come must be made from the same.
+        slabs: all slabs of the volume.
+        made_from: data and settings, by name. All slabs must be made from the same values.
         kept: other values that the remaining slabs need, in a form that JSON can represent.
     """
 
@@ -56,7 +56,7 @@ class PartialVolume:
 
     @property
     def volume(self) -> NDArray[np.float32]:
-        """float32 [z, y, x], a memory map; slices of missing slabs are zero."""
+        """float32 [z, y, x] as a memory map. Slices of missing slabs are zero."""
         return self._maps["volume"]
 
     def has(self, n: int) -> bool:
@@ -69,7 +69,7 @@ class PartialVolume:
         return sum(slab.own.stop - slab.own.start for n, slab in enumerate(self.slabs) if self.has(n))
 
     def add(self, n: int, data: NDArray[np.float32] | None) -> None:
-        """Store slab n, [z, y, x] of all slices that were reconstructed for it; None: zero."""
+        """Store slab n: [z, y, x] of all slices that were reconstructed for it. None: the slab is zero."""
         slab, state, volume = self.slabs[n], self._maps["state"], self.volume
         if data is not None:
             shared = _shared(slab)
@@ -88,7 +88,7 @@ class PartialVolume:
         self._maps["done_text"][0] = f"{self.n_slices_done} of {len(volume)} slices"
 
     def _written(self, name: str) -> None:
-        """Return when it is on the disk, so that after a loss of power no slab counts that is not there."""
+        """Return when the data are on the disk, so that no slab is counted that a loss of power could remove."""
         self._maps[name].flush()
 
     def _take_out(self) -> None:
@@ -102,10 +102,11 @@ class PartialVolume:
 def create_partial(
     path: Path, record: ReconRecord, slabs: Sequence[Slab], made_from: Mapping[str, Value], kept: Mapping[str, Any]
 ) -> PartialVolume:
-    """Create a file without any slab; the arguments are the attributes of `PartialVolume`, `record` without its voxels.
+    """Create a file without slabs. The arguments are the attributes of `PartialVolume`, and `record` without its
+    voxels.
 
     Raises:
-        DataError: the path exists, or the disk has no room; nothing is left there.
+        DataError: the path exists, or the disk has too little free space. No file is left.
     """
     nz, *shape = record.volume.grid.shape
     with atomic_file(path) as partial:
@@ -115,12 +116,13 @@ def create_partial(
             file[_PLACES["state"]] = np.zeros(len(slabs), np.uint8)
             group = file[_SLABS]
             group["table"] = [[s.own.start, s.own.stop, s.slices.start, s.slices.stop, s.fade] for s in slabs]
-            group["kept"] = json.dumps(kept, default=plain, allow_nan=True)  # taken back to the bit
+            group["kept"] = json.dumps(kept, default=plain, allow_nan=True)  # restored exactly, to the bit
             for name, value in made_from.items():
                 group[f"made_from/{name}"] = value
             deepest = max(1, *(len(_shared(slab)) for slab in slabs))
             shared = file.create_dataset(_PLACES["shared_before"], (deepest, *shape), np.float32)
-            shared[-1, -1, -1] = 0  # which allocates it, at the end: HDF5 cuts it off when it goes
+            # this allocates the space at the end of the file; HDF5 removes it when it closes the file
+            shared[-1, -1, -1] = 0
         with partial.open("r+b") as whole:
             reserve(whole.fileno(), partial.stat().st_size, path.parent)
     return open_partial(path)
@@ -130,7 +132,7 @@ def open_partial(path: Path) -> PartialVolume:
     """Open the file to add slabs to it.
 
     Raises:
-        DataError: the file is not a partial volume, is damaged, or another process is adding slabs to it.
+        DataError: the file is not a partial volume, it is damaged, or another process is adding slabs to it.
     """
     _refuse_unusable(path)
     lock = WriterLock(path)
@@ -149,10 +151,10 @@ def open_partial(path: Path) -> PartialVolume:
 
 
 def slabs_of_partial(path: Path) -> tuple[list[Slab], list[Slab]]:
-    """All slabs, and the unfinished ones.
+    """All slabs, and the slabs that are not finished.
 
     Raises:
-        DataError: as `open_partial`.
+        DataError: as for `open_partial`.
     """
     _refuse_unusable(path)
     with hdf5.readable(path), opened_whole(path) as file:
@@ -188,5 +190,5 @@ def is_partial(path: Path) -> bool:
 
 
 def _shared(slab: Slab) -> list[int]:
-    """Slices to which another slab adds, too."""
+    """The slices of a slab to which another slab also contributes."""
     return [slab.slices.start + k for k, share in enumerate(slab.share) if 0 < share < 1]

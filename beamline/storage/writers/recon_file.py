@@ -1,6 +1,8 @@
-"""Reconstruction files: a volume with all settings and its history, as NXtomoproc; written completely or not at all.
+"""Writes and reads reconstruction files: a volume with all settings and its history, as NXtomoproc. A file is written
+completely or not at all.
 
-Checkpoints hold a fit's state and what it was made from; each whole, in place of the one before.
+Also writes and reads checkpoints: the state of a fit, with its data and settings. A new checkpoint replaces the one
+before only when it is complete.
 """
 
 from __future__ import annotations
@@ -29,10 +31,11 @@ from recon.base.volume import Grid, Volume, VolumeSeries
 
 DEFINITION = "NXtomoproc"
 DEVIATION, CHANGE, DISPLACEMENT = "data_errors", "change", "displacement"
-"""Datasets next to the volume: the standard deviation of each voxel, the volume minus a moved reference, and (with _z,
-_y and _x) the displacement of that reference."""
+"""Names of datasets next to the volume: the standard deviation of each voxel, the volume minus a moved reference, and
+(with _z, _y and _x) the displacement of the reference.
+"""
 SUFFIXES = (".h5", ".hdf5", ".nxs")
-_SLAB = 16  # slices written at a time
+_SLAB = 16  # slices that are written together
 _UNITS_OF_MODEL = {
     "centres": "length", "widths": "length", "densities": "voxel", "density_unit": "voxel",
     "pixel_pitch": "length", "source_distances": "length", "view_angles": "rad", "view_roll": "rad", "view_tilt": "rad",
@@ -45,17 +48,17 @@ def write_reconstruction(path: Path, record: ReconRecord, *, replace: bool = Fal
     """Write `record` to `path` as NXtomoproc (NeXus definitions, applications/NXtomoproc).
 
     Raises:
-        DataError: if `path` exists and `replace` is not set, or the disk refuses; no partial file stays.
+        DataError: `path` exists and `replace` is False, or the disk failed. No incomplete file is left.
     """
     with atomic_file(path, replace=replace) as partial:
         write_record(partial, record)
 
 
 def write_record(path: Path, record: ReconRecord, *, empty: bool = False) -> None:
-    """Write the new file `path`, sixteen slices at a time. Raises OSError on a disk error.
+    """Write the new file `path`, sixteen slices at a time. Raises OSError if the disk failed.
 
     Args:
-        empty: without the voxels, for which there is one place, of zeros.
+        empty: True: the voxels are not written, but their space is allocated as one block of zeros.
     """
     with hdf5.created(path) as file:
         write_entry(file, record, empty)
@@ -70,17 +73,19 @@ def write_entry(file: hdf5.NewFile, record: ReconRecord, empty: bool) -> None:
     data.attrs["signal"] = "data"
     times = [] if record.series is None else ["time"]
     data.attrs["axes"] = [*times, "z", "y", "x"]
-    # One slice a chunk: viewers page through z; gzip would cost minutes on large volumes and gain little on noise.
+    # One slice per chunk, because viewers show one slice after the other. Compression with gzip would take minutes for
+    # large volumes and save little, because of the noise.
     shape = record.volume.grid.shape
     voxels = [record.volume.data] if record.series is None else record.series.each()
     several = () if record.series is None else (len(voxels),)
     chunk = None if empty else (1, *shape[1:]) if record.series is None else (1, 1, *shape[1:])
     stored = data.create_dataset("data", (*several, *shape), np.float32, chunks=chunk)
     if empty:
-        stored[-1, -1, -1] = 0  # which allocates it
-    for at, one in zip(np.ndindex(several), voxels, strict=True):
-        for first in range(0, 0 if empty else shape[0], _SLAB):  # so that a signal need not wait for the whole
-            stored[(*at, slice(first, first + _SLAB))] = one[first : first + _SLAB]
+        stored[-1, -1, -1] = 0  # allocates the space
+    for index, one in zip(np.ndindex(several), voxels, strict=True):
+        # writes in pieces, so that a signal need not wait for the whole volume
+        for first in range(0, 0 if empty else shape[0], _SLAB):
+            stored[(*index, slice(first, first + _SLAB))] = one[first : first + _SLAB]
             file.require_taken()
     if record.series is not None:
         data["time"] = record.series.seconds
@@ -101,7 +106,7 @@ def write_entry(file: hdf5.NewFile, record: ReconRecord, empty: bool) -> None:
 
 
 def _beside(record: ReconRecord) -> dict[str, tuple[NDArray[np.float32], str]]:
-    """Arrays [z, y, x] beside the volume by the names of their datasets, and what they are."""
+    """The arrays [z, y, x] next to the volume, by the names of their datasets, with descriptions."""
     arrays = {}
     if record.deviation is not None:
         arrays[DEVIATION] = record.deviation, "standard deviation of each voxel"
@@ -146,7 +151,9 @@ def _group(parent: h5py.Group, name: str, nx_class: str) -> h5py.Group:
 
 
 def new_plot(file: hdf5.NewFile, signal: str, grid: Grid, unit: str) -> h5py.Group:
-    """The group entry/data of a new file as NXdata, its default plot: with axes z, y and x, without the signal."""
+    """Create the group entry/data of a new file as NXdata, which is the default plot. It gets the axes z, y and x, but
+    not yet the signal.
+    """
     file.attrs["default"] = "entry"
     entry = _group(file, "entry", "NXentry")
     entry.attrs["default"] = "data"
@@ -162,7 +169,7 @@ def read_reconstruction(path: Path) -> ReconRecord:
     """Read the record written by `write_reconstruction`.
 
     Raises:
-        DataError: if the file is missing or is not such a file.
+        DataError: the file is missing, or it is not a reconstruction file.
     """
     with opened_reconstruction(path) as record, hdf5.readable(path):
         values = np.asarray(record.volume.data[:], dtype=np.float32)
@@ -172,13 +179,13 @@ def read_reconstruction(path: Path) -> ReconRecord:
 
 @contextmanager
 def opened_reconstruction(path: Path, at: int | None = None) -> Iterator[ReconRecord]:
-    """`read_reconstruction` without loading voxels: they are read when the volume is sliced along z.
+    """Like `read_reconstruction`, but voxels are read when the volume is sliced along z.
 
     Args:
         at: number of one of several volumes in time.
 
     Raises:
-        DataError: if the file is missing or is not such a file, or `at` names none of its volumes.
+        DataError: the file is missing, it is not a reconstruction file, or it does not contain volume `at`.
     """
     if not path.is_file():
         raise DataError(f"{path} does not exist.")
@@ -199,23 +206,24 @@ def opened_reconstruction(path: Path, at: int | None = None) -> Iterator[ReconRe
 
 
 def volumes_in_time(file: h5py.File) -> int:
-    """Number of volumes of a time series in a file of this program; 0 if the file has a single volume."""
+    """Number of volumes of the time series in a file of this program; 0 if the file contains a single volume."""
     stored = file["entry/data/data"]
     return int(stored.shape[0]) if stored.ndim == 4 else 0
 
 
-def _read_entry(entry: h5py.Group, at: int | None) -> ReconRecord:
+def _read_entry(entry: h5py.Group, number: int | None) -> ReconRecord:
     data, process = entry["data"], entry["reconstruction"]
     z, y, x = (np.asarray(datasets.values_of(data[name])) for name in ("z", "y", "x"))
-    # An axis of one voxel says nothing about the voxel size, the longer one says it best; slices may be higher.
+    # An axis with one voxel does not show the voxel size, and a longer axis shows it more precisely. Slices may be
+    # thicker.
     height = _pitch(z)
     size = _pitch(max(y, x, key=len)) or height or 1.0
     pitch = None if height is None or math.isclose(height, size, rel_tol=1e-3) else height
     centre = tuple(float(a[0] + a[-1]) / 2 for a in (z, y, x))
     stored, series = data["data"], None
-    if at is not None:
+    if number is not None:
         series = VolumeSeries(np.asarray(data["time"][:]), stored)
-        stored = series.each()[at]
+        stored = series.each()[number]
     grid = Grid(stored.shape, size, centre, pitch)  # type: ignore[arg-type]
     parameters = {name: value_of(node) for name, node in process["parameters"].items()}
     return ReconRecord(
@@ -236,12 +244,12 @@ def _read_entry(entry: h5py.Group, at: int | None) -> ReconRecord:
 
 
 def _pitch(axis: NDArray[np.floating]) -> float | None:
-    """Distance from voxel to voxel; None if there is one voxel."""
+    """Distance between voxels; None if there is only one voxel."""
     return float(axis[-1] - axis[0]) / (axis.size - 1) if axis.size > 1 else None
 
 
 def value_of(node: h5py.Dataset) -> Value:
-    """Value of a dataset, as text or number if it is one."""
+    """Value of a dataset: a text, a number, or an array."""
     value = node[()]
     if isinstance(value, bytes):
         return value.decode()
@@ -256,7 +264,7 @@ class Checkpoint:
     """The state of an interrupted fit.
 
     Attributes:
-        state: arrays by name, see recon.splatting.checkpoint.
+        state: arrays of the state by name, see recon.splatting.checkpoint.
         made_from: data and settings of the fit, by name; they must be the same when it resumes.
         steps: planned number of steps; 0 if a time limit was planned.
     """
@@ -270,7 +278,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     """Write `checkpoint` to `path`, atomically replacing an older one.
 
     Raises:
-        DataError: the disk refuses; an older checkpoint stays as it was.
+        DataError: the disk failed. An older checkpoint is unchanged.
     """
     with atomic_file(path, replace=True) as partial, hdf5.created(partial) as file:
         file.attrs["format"], file.attrs["version"] = _FORMAT, version()
@@ -285,7 +293,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
     """Read the checkpoint written by `write_checkpoint`.
 
     Raises:
-        DataError: there is none, the file is something else, or damaged.
+        DataError: the file is missing, damaged, or not a checkpoint.
     """
     if not path.is_file():
         raise DataError(f"{path} does not exist; give a checkpoint that recon --checkpoint wrote.")
@@ -300,5 +308,6 @@ def read_checkpoint(path: Path) -> Checkpoint:
                 {name: value_of(node) for name, node in file["made_from"].items()},
                 int(file.attrs["steps"]),
             )
-    except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError) as error:  # h5py's
+    # errors of h5py
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError) as error:
         raise DataError(f"{path} is not a readable checkpoint ({error}); recon --checkpoint writes one.") from error

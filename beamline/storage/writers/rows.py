@@ -1,9 +1,9 @@
-"""Rows of a scan file, one per frame, and the final entries of the file.
+"""Writes the rows of a scan file, one for each frame, and the final entries of the file.
 
-It tells how the scan ended, which triggers gave no frame and why, and has the frames as /exchange, the layout of De
-Carlo et al. (2014), "Scientific data exchange: a schema for HDF5-based storage of raw and analyzed data",
-J. Synchrotron Rad. 21, 1224: data, data_white, data_dark [frame, row, col] and theta in degrees, as virtual datasets
-without a copy.
+The final entries state how the scan ended, and which triggers gave no frame and why. They also contain the view
+/exchange of the frames. Its layout is that of De Carlo et al. (2014), "Scientific data exchange: a schema for
+HDF5-based storage of raw and analyzed data", J. Synchrotron Rad. 21, 1224: data, data_white and data_dark [frame, row,
+col], and theta in degrees. They are virtual datasets, so no pixels are copied.
 """
 
 from __future__ import annotations
@@ -30,14 +30,15 @@ from beamline.storage.writers import layout
 from drivers.base.frame import Frame, FrameKind
 from recon.base.arrays import I64
 
-ROOM = 2**24  # bytes on the disk, far more than the /exchange view takes
-PER_FLUSH = 64  # rows that are written before a flush where nobody reads yet
+ROOM = 2**24  # bytes on the disk, far more than the /exchange view needs
+PER_FLUSH = 64  # rows written before a flush if nobody is reading yet
 
 
 class Rows:
-    """Writes rows into a file made by create(). It has access to datasets only: it cannot create or delete.
+    """Writes rows into a file that create() made. It only accesses existing datasets, and cannot create or delete any.
 
-    Pixels are written at once, metadata at `flush`: the columns of several rows cost as much as those of one row.
+    Pixels are written at once, metadata at `flush`: writing the columns of several rows takes as long as writing those
+    of one row.
     """
 
     def __init__(self, file: h5py.File) -> None:
@@ -48,9 +49,10 @@ class Rows:
         self._first, self._pending = 0, list[dict[str, Any]]()
 
     def write(self, frame: Frame, digest: FrameDigest, mark: Mark = UNMARKED) -> None:
-        """Write the row `frame.index`, an existing one or the next: pixels at once, metadata at the next `flush`.
+        """Write the row `frame.index`, which exists or is the next one. Pixels are written at once, metadata at the
+        next `flush`.
 
-        A projection that it replaces becomes an invalid frame, so that no program takes both.
+        If the frame replaces a projection, that projection becomes an invalid frame, so that no program uses both.
         """
         row = frame.index
         if row != self._first + len(self._pending):
@@ -69,7 +71,7 @@ class Rows:
             VALID: mark.valid,
             SCORES: mark.scores,
             REGIONS: mark.regions,
-            layout.RECORD_CHECKSUM: 0,  # worked out where the rows are written
+            layout.RECORD_CHECKSUM: 0,  # computed when the rows are written
         } | {f"/entry/digest/{name}": value for name, value in vars(digest).items()}
         for dataset, pixels in ((self._data, frame.counts), (self._preview, digest.preview)):
             self._grow(dataset, row + 1)
@@ -85,7 +87,7 @@ class Rows:
         if not self._pending:
             return
         n, record = len(self._pending), dict[str, NDArray[Any]]()
-        for path, column in self._columns.items():  # the checksum of the others is the last
+        for path, column in self._columns.items():  # the checksum of the record is the last column
             if path == layout.RECORD_CHECKSUM:
                 values = record_checksums(record)
             else:
@@ -93,13 +95,13 @@ class Rows:
             if path in layout.RECORDED:
                 record[path] = values
             self._grow(column, self._first + n)
-            place = column.id.get_space()  # a quarter of the time of h5py's own way, for twenty columns
+            place = column.id.get_space()  # for twenty columns this takes a quarter of the time of h5py's usual way
             place.select_hyperslab((self._first, *(0,) * (values.ndim - 1)), values.shape)
             column.id.write(h5py.h5s.create_simple(values.shape), place, values)
         self._first, self._pending = self._first + n, []
 
     def add_flags(self, rows: range, bits: int) -> None:
-        """Flag existing rows: a check that has seen later frames found a fault in them."""
+        """Flag existing rows, if a check found a fault in them only after it saw later frames."""
         self.flush()
         flags = self._columns[FLAGS][rows.start : rows.stop]
         marked = flags | np.uint64(bits)
@@ -108,8 +110,9 @@ class Rows:
             self._columns[VALID][rows.start : rows.stop] = marked & np.uint64(ALARMS) == 0
 
     def add_place(self, check: int, frame: int, score: float, regions: Mapping[int, Sequence[int]]) -> None:
-        """Store the score of a flag in its frame, and its regions, in existing rows; `check`: its index in the
-        legend."""
+        """Store the score of a flag in the row of its frame, and its regions in existing rows. `check` is the index of
+        the check in the legend.
+        """
         self._columns[SCORES][frame, check] = score
         for row, box in regions.items():
             self._columns[REGIONS][row, check] = box
@@ -117,7 +120,7 @@ class Rows:
     @staticmethod
     def _grow(dataset: h5py.Dataset, n: int) -> None:
         shape = dataset.id.shape
-        if shape[0] < n:  # never shrinks: a reader may hold the rows beyond
+        if shape[0] < n:  # never shrinks, because a reader may still use the rows at the end
             dataset.id.set_extent((n, *shape[1:]))
 
 
@@ -126,7 +129,7 @@ THETA = {"data": "theta", "data_white": "theta_white", "data_dark": "theta_dark"
 
 
 def add_exchange_view(file: h5py.File) -> None:
-    """Add to /exchange the rows recorded so far. Kinds without a frame get no dataset; invalid frames are omitted."""
+    """Add the rows so far to /exchange. A kind without frames gets no dataset. Invalid frames are omitted."""
     source, angles, group = file[layout.DATA], file[layout.ANGLE][()], file.require_group(layout.EXCHANGE)
     units = file["/entry/record/quantity"].asstr()[()]
     for name, rows in _rows(file).items():
@@ -148,10 +151,10 @@ def has_exchange_view(file: h5py.File) -> bool:
 
 
 def put_exchange_view(path: Path) -> None:
-    """Add the /exchange view to a closed scan file. No block on which frames depend is written.
+    """Add the /exchange view to a closed scan file. The part of the file that contains the frames is not changed.
 
     Raises:
-        DataError: the disk fails, or has less than ROOM free.
+        DataError: the disk failed, or has less than ROOM bytes free.
     """
     if (free := shutil.disk_usage(path.parent).free) < ROOM:
         raise DataError(
@@ -173,7 +176,7 @@ def _rows(file: h5py.File) -> dict[str, I64]:
 
 
 STATUSES = ("complete", "stopped", "failed")
-RUNNING = "running"  # of a scan that continues, or whose program died
+RUNNING = "running"  # for a scan that continues, or whose program was killed
 DIED = "The process that took the scan was killed."
 
 

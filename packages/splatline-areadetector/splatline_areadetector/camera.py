@@ -21,8 +21,8 @@ from splatline_areadetector.camera_records import DRIVERS, LOOK_EVERY, DriverLab
 from splatline_areadetector.stream import Died, Disconnected, FrameStream, Item, Overflow, Queues, Refused
 
 _SETTLED = 0.2  # s without a frame, after which a stopped camera counts as silent
-_LONGEST = 3600.0  # s, exposure
-_LEAST_RING = 2  # frames
+_LONGEST = 3600.0  # longest exposure in s
+_LEAST_RING = 2  # smallest number of frames in the ring
 
 
 @dataclass(frozen=True)

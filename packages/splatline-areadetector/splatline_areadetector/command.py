@@ -45,6 +45,11 @@ def _print_example(ctx: click.Context, param: click.Parameter, value: bool) -> N
 @click.option(
     "--flats", metavar="FILE", help="Flats for a scan that takes none: a scan file, HDF5 (FILE::DATASET) or TIFF."
 )
+@click.option(
+    "--reference", metavar="GOOD", type=click.Path(path_type=Path),
+    help="Volume of the same sample from an earlier, careful scan, or that scan itself; used as by `beamline scan`. "
+    "The same as recon.reference in CONFIG.",
+)  # fmt: skip
 @click.option("--page", is_flag=True, help="Show the runs in the browser; all runs have the same address.")
 @click.option("--no-live", is_flag=True, help="Do not reconstruct during the scan.")
 @click.option(
@@ -61,6 +66,7 @@ def ride(
     only_check: bool,
     darks: str | None,
     flats: str | None,
+    reference: Path | None,
     as_json: bool,
     **more: object,
 ) -> None:
@@ -75,10 +81,12 @@ def ride(
 
     Example: beamline ride my.yaml --page
     """
-    from beamline.config.load import load_as
+    from beamline.config.load import load_as, override_of
     from splatline_areadetector.config import RideConfig
     from splatline_areadetector.ride import load_given
 
+    if reference is not None:
+        overrides = (*overrides, override_of("recon.reference", reference.resolve()))
     config = load_as(RideConfig, file, overrides, printed_by="beamline ride --example")
     if only_check:
         from splatline_areadetector.looks import check

@@ -170,7 +170,7 @@ class RideConfig(Section):
         return None
 
     @model_validator(mode="after")
-    def _steps_turn(self) -> Self:
+    def _is_possible(self) -> Self:
         angles = self.ride.angles
         if isinstance(angles, PlanAngles) and angles.views > 1 and not math.fabs(angles.step_deg) > 0:
             raise ValueError(
@@ -180,6 +180,8 @@ class RideConfig(Section):
             raise ValueError(
                 "monitor.retake: `beamline ride` cannot take projections again, because another program runs the scan"
             )
+        if (missing := self.recon.missing_reference) is not None:
+            raise ValueError(missing)
         return self
 
 

@@ -27,8 +27,8 @@ from splatline_areadetector.config import (
     RideSection,
     TomoscanAngles,
 )
+from splatline_areadetector.frame_places import BY_ORDER, UNKNOWN_KIND, BlockKey
 from splatline_areadetector.plan import PlannedBlock, RidePlan
-from splatline_areadetector.sorter import BY_ORDER, UNKNOWN_KIND, BlockKey
 from splatline_areadetector.variables import History, Variables
 
 LOCATIONS = {"data_dark": FrameKind.DARK, "data_white": FrameKind.FLAT, "data": FrameKind.PROJECTION}

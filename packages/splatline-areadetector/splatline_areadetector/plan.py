@@ -42,7 +42,7 @@ class RidePlan:
     """The scan as its program plans it.
 
     Attributes:
-        blocks: in the order of acquisition.
+        blocks: the blocks in the order of acquisition.
         angles: float64 [view] in radians; NaN if only the frames contain them. exposures: exposure in s by kind; a kind
             that is not listed has the exposure of projections. period: time in s between frames; None: not known.
             told_by: source of the plan, for the metadata.
@@ -55,12 +55,12 @@ class RidePlan:
     angle_source: str
 
     def exposure(self, kind: FrameKind) -> float:
-        """s; NaN: not known."""
+        """Exposure in s of the frames of this kind; NaN: not known."""
         return self.exposures.get(kind, self.exposures.get(FrameKind.PROJECTION, math.nan))
 
     @property
     def first_triggers(self) -> list[int]:
-        """Of each block, within the whole plan."""
+        """The first trigger of each block, counted in the whole plan."""
         return [0, *accumulate(block.n for block in self.blocks[:-1])]
 
 

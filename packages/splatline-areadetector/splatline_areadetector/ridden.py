@@ -27,9 +27,10 @@ from drivers.base.frame import Frame, FrameKind
 from splatline_areadetector.arrays import ArrayFrame
 from splatline_areadetector.config import RideConfig
 from splatline_areadetector.counters import Counters, Gap, Silence, loss_sentences
+from splatline_areadetector.frame_places import Basis, Decision, FramePosition, NewEpoch, Outside, Seen, Unknown
 from splatline_areadetector.guides import EXPOSURE, Guide, seconds_of
 from splatline_areadetector.plan import RidePlan
-from splatline_areadetector.sorter import Basis, Decision, FramePosition, NewEpoch, Outside, Seen, Sorter, Unknown
+from splatline_areadetector.sorter import Sorter
 from splatline_areadetector.stream import Died, Disconnected, FrameStream, Overflow, Refused
 
 SLICE = 0.25  # s: longest wait for a frame before the stop request is checked again
@@ -86,8 +87,8 @@ class RiddenFrames:
         self._sorter = Sorter(plan.blocks, first_id, ride.counters, before, began_within_scan=began_within_scan)
         self._gaps: list[Gap] = []
         self._overflowed: set[int] = set()
-        self._last: ArrayFrame | None = None  # that has a place
-        self._arrived: ArrayFrame | None = None  # the last one
+        self._last: ArrayFrame | None = None  # the last frame that has a place in the plan
+        self._arrived: ArrayFrame | None = None  # the last frame
         self._unplaced: dict[str, list[int]] = {}
         self._unused: dict[str, list[int]] = {}  # for each reason, numbers of frames that arrived and cannot be used
         self._block, self._block_kind, self._in_block = -1, "", 0

@@ -20,6 +20,7 @@ from drivers.base.frame import FrameKind
 from splatline_areadetector.arrays import ArrayFrame
 from splatline_areadetector.config import RideConfig, TomoscanAngles
 from splatline_areadetector.counters import Counters, Silence, refuse_mistakes
+from splatline_areadetector.frame_places import BY_ORDER, UNKNOWN_KIND, Seen
 from splatline_areadetector.guides import EXPOSURE, Guide, guide_of, seconds_of
 from splatline_areadetector.plan import PlannedBlock, RidePlan, ready_of
 from splatline_areadetector.ridden import (
@@ -32,7 +33,7 @@ from splatline_areadetector.ridden import (
     outside_sentence,
     seen_of,
 )
-from splatline_areadetector.sorter import BY_ORDER, UNKNOWN_KIND, Seen, n_before_views, not_set
+from splatline_areadetector.sorter import n_before_views, not_set
 from splatline_areadetector.stream import FrameStream, Refused
 
 

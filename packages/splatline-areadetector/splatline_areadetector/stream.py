@@ -27,10 +27,10 @@ from splatline_areadetector.arrays import ArrayFrame, array_frame
 from splatline_areadetector.receiver import frame_of
 
 SCHEME = "pva://"
-_LEAST, _MOST = 4, 1000  # frames of the queue
+_LEAST, _MOST = 4, 1000  # frames in the queue
 _USUAL = 100.0  # frames/s of a camera whose period is not known
 _STARTS, _AGAIN = 60.0, 0.5  # s for a receiver to start, and before another one is started
-_AT_HAND = 4  # items held in this process; all others wait in the receiver
+_AT_HAND = 4  # number of items in this process; all other items wait in the receiver
 _PIPE = 2**20  # bytes
 ANSWERS_WITHIN = 3.0  # s
 UNREACHABLE = "Check the name, whether its IOC runs, and which hosts are searched (EPICS_PVA_ADDR_LIST)"

@@ -34,6 +34,11 @@ def config_of(folder: Path, url: str, angles: Any = PLAN, **ride: Any) -> RideCo
     section = {"image": url, "angles": angles, "exposure_s": 0.01, "silence_s": 2.0, **ride}
     values = {"sample": {"name": "s"}, "ride": section, "optics": {"pixel_size_um": 1}, "storage": {"folder": "runs"}}
     path.write_text(yaml.safe_dump(values), encoding="utf-8")
+    return reread(path)
+
+
+def reread(path: Path) -> RideConfig:
+    """The configuration of a ride in a file."""
     return load_as(RideConfig, path, printed_by="beamline ride --example")
 
 

@@ -19,8 +19,8 @@ from beamline.core.errors import ConfigError, DataError
 from drivers.base.errors import DeviceTimeout
 from drivers.base.frame import FrameKind
 from splatline_areadetector.arrays import ArrayFrame, array_frame
+from splatline_areadetector.frame_places import BY_ORDER, NO_SCAN, UNKNOWN_KIND, BlockKey
 from splatline_areadetector.guides import TomoscanGuide, guide_of, kind_of
-from splatline_areadetector.sorter import BY_ORDER, NO_SCAN, UNKNOWN_KIND, BlockKey
 from splatline_areadetector.variables import History, Variables, url_problem
 
 CLIENT = """

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
 from drivers.base.frame import FrameKind
-from splatline_areadetector.plan import PlannedBlock
-from splatline_areadetector.sorter import (
+from splatline_areadetector.frame_places import (
     BY_ORDER,
     NO_SCAN,
     UNKNOWN_KIND,
@@ -25,9 +24,10 @@ from splatline_areadetector.sorter import (
     NewEpoch,
     Outside,
     Seen,
-    Sorter,
     Unknown,
 )
+from splatline_areadetector.plan import PlannedBlock
+from splatline_areadetector.sorter import Sorter
 
 DARK, FLAT, VIEW = FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION
 BLOCKS = (PlannedBlock(DARK, 2), PlannedBlock(VIEW, 5), PlannedBlock(FLAT, 3))

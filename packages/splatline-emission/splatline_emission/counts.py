@@ -24,7 +24,9 @@ _RAYS = (-1 / 3, 0.0, 1 / 3)  # rays of a pixel: distances from its middle along
 
 @dataclass(frozen=True)
 class Rod:
-    """A cylinder along the axis. `activity` and `mu` are relative to those of the displaced material. `at`: (x, y)."""
+    """A cylinder along the axis at the position `at` (x, y). `activity` and `mu` are relative to the displaced
+    material.
+    """
 
     radius: float
     at: tuple[float, float]

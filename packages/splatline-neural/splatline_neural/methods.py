@@ -97,7 +97,7 @@ class FieldMethod(Iterative):
         return replace(self, steps=2, seconds=None, rays=min(self.rays, 16))
 
     def for_part(self, share: float, of_time: float) -> Self:
-        """The method for a part of a volume, with its part of the time limit."""
+        """The same method for a part of a volume, with a part of the time limit."""
         return replace(self, seconds=None if self.seconds is None else of_time * self.seconds)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
@@ -237,7 +237,9 @@ class _Fit:
 
     @torch.no_grad()
     def volume(self, grid: Grid) -> F32:
-        """Density [z, y, x] in density units at the centres of voxels. Lines along x are the lines of the network."""
+        """Density [z, y, x] in density units at the centres of voxels. A line of the network is a line of voxels along
+        x.
+        """
         low, high = self.views.grid.edges
         edge = (high - low).max()
         z, y, x = (

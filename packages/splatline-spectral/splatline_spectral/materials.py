@@ -185,8 +185,8 @@ def joined(
     for path in scans:
         with open_scan(path) as scan:
             parts.append(prepare_projections(select(scan, selection), warn))
-        selection = replace(selection, axis_col=parts[0].axis_col)
-    if parts[0].length_unit != "mm":
+        selection = replace(selection, axis_col=parts[0].origin.axis_col)
+    if parts[0].origin.length_unit != "mm":
         raise ConfigError("The scans must state the pixel size, because the spectra are in 1/mm. Nothing was written.")
     first, weights = parts[0].geometry, [part.views.seen.weights for part in parts]
     geometry = first

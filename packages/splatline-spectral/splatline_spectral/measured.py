@@ -25,7 +25,7 @@ PixelBox = tuple[int, int, int, int]
 FramePart = tuple[slice, slice]
 Read = Callable[[int, FramePart], Reals]  # line integrals [row, col] at an energy, for a part of the frame
 
-_MOST_VIEWS = 32  # evenly spread; more would improve little and take long to read
+_MOST_VIEWS = 32  # number of projections, evenly spread; more would improve little and take long to read
 _EV_BEYOND, _KEV_BELOW = 500.0, 0.05
 """keV: no beamline has energies above the first or below the second, so the unit must be wrong."""
 _KEV = {"keV": 1.0, "eV": 1e-3}

@@ -25,7 +25,7 @@ from splatline_spectral.contrast import AbsorptionEdge, XafsCurve
 
 @dataclass(frozen=True, eq=False)
 class XafsResult:
-    """A curve and its edge. `title`: what was scanned. `elements`: those of the material; empty: not known."""
+    """A curve and its edge. `title`: what was scanned. `elements`: elements of the material; empty: not known."""
 
     title: str
     curve: XafsCurve
@@ -33,7 +33,7 @@ class XafsResult:
     elements: tuple[int, ...] = ()
 
     def data(self) -> dict[str, Any]:
-        """Values for programs; energies in keV."""
+        """The values for programs. Energies are in keV."""
         curve, edge, cnr = self.curve, self.edge, self.curve.contrast_to_noise
         return {
             "what": self.title, "n_energies": curve.energies.size, "n_left_out": curve.left_out.size,

@@ -180,9 +180,9 @@ class Jobs:
     """The curves to compute for each source.
 
     Attributes:
-        low, high, step: keV; for a file, `low` and `high` select a part of its energies.
-        material, seed, charges: for a scene; no charges: that of the scene.
-        regions, around, unit: for a file; (row, end, column, end) of the material and of its surroundings.
+        low, high, step: energies in keV; for a file, `low` and `high` select a part of its energies.
+        material, seed, charges: used for a scene; without charges, the state of charge is that of the scene.
+        regions, around, unit: used for a file; (row, end, column, end) of the material and of its surroundings.
     """
 
     low: float | None = None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,38 +10,15 @@ import click
 from beamline.cli.options import json_option, parsed
 from beamline.cli.recipe import Repeatable, typed_line
 from beamline.cli.terminal import Answer, answering
-from beamline.core.errors import ConfigError, DataError
+from beamline.core.errors import DataError
 from beamline.core.files import atomic_file, refuse_existing
-from beamline.core.sinks import Note
 from beamline.core.text import count, memory_size, safe_name
 from splatline_structure.options import edges_of, numbers_in_text, refuse_together
 
 if TYPE_CHECKING:
-    from splatline_structure.intervals import MeasuredStructure
-    from splatline_structure.volumes import Box, ReadSlices
+    from splatline_structure.measuring import Seen
 
 _FILE = click.Path(path_type=Path)
-FEWEST_VIEWS = 16  # fewest projections that can be divided, 8 in each half
-
-
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """A volume that was read, and what was measured in it.
-
-    Attributes:
-        grid, volume: the grid and the voxels of the box.
-    """
-
-    path: Path
-    read: ReadSlices
-    box: Box
-    grid: Any
-    volume: Any
-    found: MeasuredStructure
-
-    def voxels(self, slices: slice) -> str:
-        """The box in these slices of the volume, as text for the tables."""
-        return ",".join(f"{each.start}:{each.stop}" for each in (slices, *self.box[1:]))
 
 
 @click.command(cls=Repeatable)
@@ -191,6 +167,7 @@ def structure(
     """
     from beamline.core.machine import free_memory
     from beamline.storage.interrupted import volume_file
+    from splatline_structure.measuring import seen_in
     from splatline_structure.volumes import read_volume
 
     refuse_together(states, compare, len(volumes), values)
@@ -214,113 +191,10 @@ def structure(
         seen = []
         for path, read in zip(paths, reads, strict=True):
             try:
-                seen.append(_seen(path, read, answer, **values))
+                seen.append(seen_in(path, read, answer, **values))
             except ValueError as error:
                 raise DataError(f"{path} cannot be measured: {error}. Nothing was written.") from error
         _write(seen, compare, output, values, answer)
-
-
-def _seen(path: Path, read: ReadSlices, answer: Answer, **values: Any) -> Seen:
-    """Measure one volume."""
-    from splatline_structure import intervals, volumes
-
-    if read.limit_sentence:
-        answer.warn(f"{path}: {read.limit_sentence}")
-    box = volumes.box_in(read.record.volume.data, values["crop"])
-    seen = measured(path, read, box, answer, **values)
-    if not read.limit_sentence:
-        return seen
-    slabs = volumes.slabs_of(path, values["dataset"], read, seen.box, answer.counting("reading slabs"))
-    return replace(seen, found=intervals.with_all_slices(seen.found, slabs))
-
-
-def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: Any) -> Seen:
-    """Measure the slices of a volume that were read.
-
-    Args:
-        box: the part to measure, also in the volumes from halves of the projections.
-
-    Raises:
-        ConfigError: there is no such material. ValueError: no contrast, or the halves have other shapes.
-    """
-    import numpy as np
-
-    from splatline_structure.intervals import measured_structure
-    from splatline_structure.materials import label_values
-    from splatline_structure.numbers import Rules
-
-    grid, data, parts = read.record.grid.part(*box), read.record.volume.data, []
-    volume = np.ascontiguousarray(data[box])
-    labels = label_values(volume)
-    n_materials = values["materials"] or labels.size or 2
-    particles = values["particles"] or n_materials
-    if labels.size not in (0, n_materials):
-        raise ValueError(
-            f"leave out --materials {n_materials}: the volume contains only {labels.size} different values "
-            f"({', '.join(f'{each:g}' for each in labels)}), so they are labels and not grey values. Each label is a "
-            "material"
-        )
-    if labels.size:
-        materials = (f"{each:g} is material {number}" for number, each in enumerate(labels, 1))
-        answer.warn(
-            Note(
-                f"{path} contains few different values, so they are read as labels and not as grey values: "
-                f"{', '.join(materials)}."
-            )
-        )
-    if max(particles, values["through"]) > n_materials:
-        raise ConfigError(
-            f"There is no material {max(particles, values['through'])}: the {n_materials} materials are numbered from "
-            "1. Nothing was written."
-        )
-    for half in _parts(path, read, answer, **values):
-        if half.shape != data.shape:
-            raise ValueError(
-                f"the volume from half of the projections has the shape {half.shape}, not {data.shape}: give --parts "
-                "with volumes of the same shape as the volume itself, or --quick"
-            )
-        parts.append(np.ascontiguousarray(half[box]))
-    rules = Rules(particles, values["through"], values["radius"], values["smallest"], values["neck"], values["side"])
-    dz, dy, dx = (1e3 * edge for edge in grid.spacing)
-    try:
-        found = measured_structure(
-            volume, parts, n_materials, (dz, dy, dx), rules, answer.counting("measuring the structure")
-        )
-    except ValueError as error:
-        way_out = (
-            f"only slices {read.slices.start}:{read.slices.stop} fit into the memory and were measured: give more "
-            "--memory, or choose other --slices"
-            if read.limit_sentence
-            else "reconstruct from more projections"
-        )
-        raise ValueError(f"{error}; {way_out}{', or give fewer --materials' if n_materials > 2 else ''}") from error
-    return Seen(path, read, box, grid, volume, found)
-
-
-def _parts(path: Path, read: ReadSlices, answer: Answer, **values: Any) -> list[Any]:
-    """The slices of the volume from each half of its projections; empty if not asked for, or if there is no scan."""
-    from beamline.storage.volumes.files import opened_volume
-    from splatline_structure.volumes import parts_of
-
-    if values["quick"]:
-        return []
-    if values["parts"]:
-        halves = []
-        for half in values["parts"]:
-            with opened_volume(half) as opened:
-                holds_all = opened.grid.shape[0] == read.n_slices  # otherwise it holds only these slices
-                halves.append(opened.volume.data[read.slices if holds_all else slice(None)])
-        return halves
-    scan = values["scan"] or Path(read.record.raw_file)
-    if not scan.is_file():
-        answer.warn(
-            f"The intervals of {path} leave out the error from few projections, because its scan {scan} does not "
-            "exist. Give --scan or --parts."
-        )
-        return []
-    if (n_views := int(read.record.parameters.get("n_views", FEWEST_VIEWS))) < FEWEST_VIEWS:
-        raise ValueError(f"{n_views} projections are too few to divide them into halves: give --quick")
-    return parts_of(read, scan, 2, answer.warn, answer.counting("reconstructing halves of the projections"))
 
 
 def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any], answer: Answer) -> None:

@@ -1,4 +1,6 @@
-"""Intervals of numbers: value, low and high end, from four causes: projections, levels, voxels and particles."""
+"""Computes intervals of numbers (value, low end, high end) from four sources of error: projections, levels, voxels and
+particles.
+"""
 
 from __future__ import annotations
 
@@ -20,23 +22,25 @@ PROBED, PARTIAL = 0.05, 0.012
 """Fractions of the gap between two levels: by how much thresholds are moved to see their effect, and by how much they
 may be wrong because of partial-volume voxels."""
 OF_KIND = {"fraction": (0.5, 0.3), "surface": (0.5, 0.2), "size": (0.0, 0.05), "tortuosity": (0.0, 0.04)}
-"""By the first word of a number's name, two factors. The first, times the change from half of the projections to all,
-estimates the change from all to infinitely many. The second, times the change from voxels twice as wide, is the
+"""Two factors for each number, by the first word of its name. The first, times the change from half of the projections
+to all, estimates the change from all to infinitely many. The second, times the change from voxels twice as wide, is the
 half-width from the voxels. OTHERS is used for other numbers, and its second factor for voxels that are not cubes. All
 values here were found on simulated grains and checked once on other grains (docs/structure.md). Sizes and tortuosities
-changed in both directions."""
-OTHERS = 0.5, 0.3
-BIAS = 0.012  # relative: fractions of grains (or of the rest) come out low by this, whatever the number of projections
-SPLIT_OR_MERGED = 0.62
-"""Some of n whole particles are split, merged or cut differently than in the sample.
-
-So the fraction s of their volume below a size is wrong by this value times √(s (1 - s) / n). Found on twenty scenes
-(docs/structure.md).
+changed in both directions.
 """
-LEVELS_MOVE = 0.5  # error of thresholds, as a factor of their change with half of the projections
+OTHERS = 0.5, 0.3
+BIAS = 0.012  # relative; fractions of grains, or of the rest, are too low by this share for any number of projections
+SPLIT_OR_MERGED = 0.62
+"""Factor for the error because some of n whole particles are split, merged or cut in another way than in the sample.
+
+The fraction s of their volume below a size is therefore wrong by this value times √(s (1 - s) / n). Found on twenty
+scenes (docs/structure.md).
+"""
+LEVELS_MOVE = 0.5  # error of thresholds, as a factor on their change with half of the projections
 UNDECIDED, SURE = 0.15, 0.8
 """Largest fraction of undecided voxels; a voxel is decided if one material has this probability or more."""
-WIDEST, NARROWEST = 0.5, 0.001  # of the value: widest interval of a number that is determined; smallest half-width
+# shares of the value: widest interval of a number that counts as determined; smallest half-width
+WIDEST, NARROWEST = 0.5, 0.001
 CAUSES = {
     "views": "more projections would narrow the interval",
     "levels": "the threshold limits this; more projections would not help",
@@ -58,7 +62,7 @@ class Interval:
         low, high: ends of the interval around the value that infinitely many projections would give.
         moves: extrapolated change of the value with more projections; NaN: there were no halves of the projections.
         views, levels, voxels, particles: half-width from each cause.
-        why_not: why the number is not determined; empty: it is.
+        why_not: why the number is not determined; empty: the number is determined.
     """
 
     value: float
@@ -78,7 +82,7 @@ class Interval:
 
     @property
     def words(self) -> str:
-        """What limits the interval, or why there is none."""
+        """What limits the interval, or why there is no interval."""
         return self.why_not or (CAUSES[self.decides] if getattr(self, self.decides) > 0 else _NO_CAUSE)
 
 
@@ -87,9 +91,9 @@ class MeasuredStructure:
     """The structure of a volume, with the intervals of its numbers.
 
     Attributes:
-        intervals: by the names of `Structure.numbers`, and those of `with_all_slices`.
+        intervals: intervals by the names of `Structure.numbers`, and by those of `with_all_slices`.
         undecided: fraction of voxels in which no material has a probability of 0.8.
-        unsure: bool [z, y, x], these voxels.
+        unsure: bool [z, y, x], True for these voxels.
         parts: structures of the volumes from parts of the projections.
         off: error of the thresholds, as a fraction of the gap between levels.
         rules: how the numbers were measured.
@@ -122,10 +126,10 @@ def measured_structure(
     Args:
         parts: the same volume from interleaved parts of its projections; empty: the intervals leave them out.
         count: number of materials.
-        tell: is called with the number of structures measured, and of all.
+        tell: function that is called with the number of structures measured and the number of all structures.
 
     Raises:
-        ValueError: no contrast between materials.
+        ValueError: there is no contrast between materials.
     """
     steps, why = 4 + len(parts), ""
     tell(0, steps)
@@ -261,8 +265,9 @@ def with_all_slices(found: MeasuredStructure, slabs: Iterable[F32]) -> MeasuredS
 
 
 def difference(one: Interval, other: Interval) -> Interval:
-    """The change between two states: the second minus the first. Half-widths are added in squares, also for each
-    cause."""
+    """The change between two states: the second minus the first. The squares of the half-widths are added, also for
+    each cause.
+    """
     value, middle = other.value - one.value, (other.high + other.low - one.high - one.low) / 2
     half = math.hypot((one.high - one.low) / 2, (other.high - other.low) / 2)
     causes: dict[str, Any] = {cause: math.hypot(getattr(one, cause), getattr(other, cause)) for cause in CAUSES}

@@ -60,7 +60,7 @@ def central(mask: NDArray[Any], side: int, spacing: Spacing = (1, 1, 1)) -> NDAr
 
 
 def label_values(volume: F32) -> F64:
-    """The values of a segmented volume (labels): 2 to 6 different values; empty for grey values."""
+    """The different values of a segmented volume (labels), 2 to 6 of them. Empty if the volume contains grey values."""
     for some in (volume[len(volume) // 2], volume):
         values = np.unique(some)
         if values.size > MOST:

@@ -18,7 +18,7 @@ from splatline_structure.transport import connecting, tortuosity
 
 @dataclass(frozen=True)
 class Rules:
-    """How numbers are measured. Voxels that are not cubes count as cubes of their shortest edge.
+    """Rules for the measurement of numbers. Voxels that are not cubes count as cubes of their shortest edge.
 
     Attributes:
         particles: number of the material whose particles are measured, from 1, the least dense.
@@ -38,19 +38,19 @@ class Rules:
 
     @property
     def of_coarse_voxels(self) -> Rules:
-        """The same rules, for voxels twice as wide."""
+        """The same rules for voxels that are twice as wide."""
         return replace(self, smallest=max(self.smallest // 8, 1), side=(self.side + 1) // 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """What was measured in a volume.
+    """The results of the measurement of a volume.
 
     Attributes:
         labels: number of each voxel's material [z, y, x], from 0.
         numbered: number of each voxel's particle, 0: none.
         particles: the particles, lengths in µm.
-        numbers: by name. NaN: there is nothing to measure. Infinity: nothing connects two faces.
+        numbers: the numbers by name. NaN: there is nothing to measure. Infinity: nothing connects the two faces.
         along_z: fraction of the particles' material in each slice.
         radial: fraction of the particles' material in rings around the middle, and the radii of the rings in µm.
     """
@@ -119,7 +119,7 @@ def coarse(volume: F32) -> F32:
 def _radial(mask: np.ndarray, spacing: Spacing) -> tuple[F64, F64]:
     _, ny, nx = mask.shape
     y, x = ((np.arange(n) - (n - 1) / 2) * edge for n, edge in zip((ny, nx), spacing[1:], strict=True))
-    ring = (np.hypot(y[:, None], x) / (2 * spacing[2])).astype(int)  # two voxels wide
+    ring = (np.hypot(y[:, None], x) / (2 * spacing[2])).astype(int)  # so that it is two voxels wide
     share = ndimage.mean(mask.mean(axis=0), ring, np.arange(ring.max() + 1))
     return share, (np.arange(ring.max() + 1) + 0.5) * 2 * spacing[2]
 

@@ -10,6 +10,8 @@ import click
 if TYPE_CHECKING:
     from splatline_structure.materials import Spacing
 
+FEWEST_VIEWS = 16
+"""Fewest projections that can be divided, 8 in each half."""
 _OF_VOLUMES = "parts", "slices", "voxel_um", "scan", "quick"  # options that --states does not take
 
 

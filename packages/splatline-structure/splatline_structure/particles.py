@@ -17,10 +17,12 @@ Numbers = NDArray[np.int32]
 
 NECK = 0.8
 """Two parts are one particle if the neck between them has at least this share of the narrower part's width."""
-_FACES = ndimage.generate_binary_structure(3, 1)  # neighbours of a voxel, with itself
+_FACES = ndimage.generate_binary_structure(3, 1)  # the neighbours of a voxel and the voxel itself
 _GRID = 0.5
-"""Error of a distance on the grid, in voxels. Without it 41 of 360 rotated ellipsoids, plates, bars and octahedra are
-split by mistake, with it 1. With it 38 of 40 pairs of touching balls are separated, without it 40."""
+"""Error of a distance on the grid, in voxels, that is tolerated. Without this tolerance 41 of 360 rotated ellipsoids,
+plates, bars and octahedra are split by mistake, with it 1. Of 40 pairs of touching balls, 38 are separated with the
+tolerance, and 40 without it.
+"""
 _DIRECTIONS = np.array([
     (z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1) if (z, y, x) > (0, 0, 0)
 ])  # fmt: skip
@@ -32,10 +34,10 @@ class Particles:
 
     Attributes:
         label: int32, number in the labelled volume.
-        volume: in the unit of length cubed.
-        surface: in the unit of length squared.
-        centroid: [particle, 3], (z, y, x).
-        cut: the particle touches a face of the volume, so its true size may be larger.
+        volume: volume in the unit of length cubed.
+        surface: surface in the unit of length squared.
+        centroid: [particle, 3], centre of mass (z, y, x).
+        cut: True if the particle touches a face of the volume, so that its true size may be larger.
         neighbours: numbers of the particles that it touches.
     """
 
@@ -157,9 +159,9 @@ def surfaces(labels: NDArray[np.integer], spacing: Spacing = (1, 1, 1), goes_on:
     Faces of cubes along the grid come out 5 % low. Faces of the volume do not count as surface.
 
     Args:
-        goes_on: the structure continues beyond the volume: crossings per pair of voxels, times all voxels, because
-            lines
-            end at the faces and a direction has fewer pairs than there are voxels.
+        goes_on: True if the structure continues beyond the volume. The crossings per pair of voxels are then multiplied
+            by the number of all voxels, because lines end at the faces, so that a direction has fewer pairs than there
+            are voxels.
     """
     steps = _DIRECTIONS * np.asarray(spacing)
     lengths = np.linalg.norm(steps, axis=1)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from recon.features.reference.particle_states import ReferenceParticles
     from splatline_structure.states import MeasuredState
 
-_LINES = 60  # most curves of single particles
+_LINES = 60  # largest number of curves of single particles
 _COLOURS = {"cracked": (1, 0.1, 0.1, 0.6), "closed": (0.1, 0.8, 0.1, 0.6), "gone": (0.2, 0.3, 1, 0.6)}
 NAMES = {"grey": "change of the grey level (%)", "volume": "change of the volume (%)"}
 

@@ -1,4 +1,4 @@
-"""`beamline structure --states`: numbers of the particles of a reference in later scans of few projections."""
+"""`beamline structure --states`: measures the particles of a reference in later scans with few projections."""
 
 from __future__ import annotations
 
@@ -52,11 +52,12 @@ _HEAD = (
 
 @dataclass(frozen=True, eq=False)
 class MeasuredState:
-    """A state and its numbers.
+    """A state and the numbers measured in it.
 
     Attributes:
-        at: its charge, or h since the first state, or its number, as `Series.across` says.
-        matches: False: most particles of the reference are not in it.
+        at: value of the state on the axis `Series.across`: its charge, the time in h since the first state, or its
+            number.
+        matches: False if most particles of the reference are missing in the state, so that it is another sample.
     """
 
     path: Path
@@ -71,9 +72,9 @@ class Series:
     """A reference and its states.
 
     Attributes:
-        path, record: of the reference's volume.
-        labels: of its particles [z, y, x].
-        across: what `MeasuredState.at` is.
+        path, record: path and record of the volume of the reference.
+        labels: labels [z, y, x] of the particles.
+        across: meaning of `MeasuredState.at`.
     """
 
     path: Path
@@ -85,11 +86,11 @@ class Series:
 
 
 def measure_states(paths: Sequence[Path], output: Path, answer: Answer, values: dict[str, Any]) -> None:
-    """Measure the particles of the first file in the scans of all others, and write the folder.
+    """Measure the particles of the volume in the first file in the scans of all other files, and write the folder.
 
     Raises:
         DataError: a file cannot be used. Nothing was written then.
-        ConfigError: a wrong option, or too little memory.
+        ConfigError: an option is wrong, or there is too little memory.
     """
     first, *scans = paths
     if not scans:
@@ -201,7 +202,7 @@ def _first_time(path: Path, record: Any, values: dict[str, Any]) -> float:
 
 
 def _abscissa(charge: list[float] | None, begun: list[float]) -> tuple[str, list[float]]:
-    """What curves are drawn against, and its value for each state."""
+    """The quantity on the horizontal axis of curves, and its value for each state."""
     if charge is not None:
         return "state of charge", charge
     if all(map(math.isfinite, begun)) and len(set(begun)) == len(begun):
@@ -227,7 +228,7 @@ def _fitted(
         raise DataError(
             f"{path}: states are measured only with a parallel beam that is not tilted. Nothing was written."
         )
-    if prepared.length_unit != "mm":
+    if prepared.origin.length_unit != "mm":
         geometry = geometry.scaled(record.grid.voxel_size / geometry.sample_pitch)
     used = prepared.views.masked()
     try:
@@ -280,12 +281,12 @@ def _write(series: Series, output: Path, values: dict[str, Any], answer: Answer)
 
 
 def _whole(state: MeasuredState, cut: np.ndarray) -> np.ndarray:
-    """The particles that are counted and whose number describe a state."""
+    """The particles that are counted, and whose numbers describe a state."""
     return np.array([v in ("as before", "cracked", "closed") for v in state.numbers.verdict]) & ~cut
 
 
 def _summary(state: MeasuredState) -> dict[str, Any]:
-    """The state for programs."""
+    """The values of the state for programs."""
     verdicts: list[str] = list(state.numbers.verdict)
     return {
         "scan": state.path, "at": state.at, "projections": state.n_views, "matches": state.matches,

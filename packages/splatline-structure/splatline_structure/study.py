@@ -13,7 +13,7 @@ from beamline.cli.terminal import answering
 from beamline.core.errors import DataError
 from beamline.core.files import atomic_file, refuse_existing, write_whole
 from beamline.core.text import csv_text, safe_name
-from splatline_structure.command import FEWEST_VIEWS, measured
+from splatline_structure.options import FEWEST_VIEWS
 
 
 def numbers_of_views(text: str) -> list[int]:
@@ -75,6 +75,7 @@ def study_structure(
     from beamline.api import Selection, reconstruct
     from beamline.report.html import Picture
     from splatline_structure import pictures, results
+    from splatline_structure.measuring import measured
     from splatline_structure.numbers import Rules, structure_of
     from splatline_structure.particles import NECK
     from splatline_structure.volumes import ReadSlices, box_in

@@ -13,7 +13,7 @@ from scipy.sparse.linalg import LinearOperator, cg, splu
 from splatline_structure.materials import F64, Mask, Spacing
 
 _CLOSE = 1e-5  # relative residual at which the solver stops
-_BLOCK, _BLOCKS = 4, 24  # shortest edge of a block in voxels; most blocks along the longest side
+_BLOCK, _BLOCKS = 4, 24  # shortest edge of a block in voxels; largest number of blocks along the longest side
 
 
 def connecting(mask: Mask, axis: int) -> Mask:

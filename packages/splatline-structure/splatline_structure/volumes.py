@@ -1,5 +1,6 @@
-"""Reads the slices of a volume that fit the memory, finds the box to measure, reconstructs halves of the
-projections."""
+"""Reads as many slices of a volume as fit into the memory, finds the box to measure, and reconstructs volumes from
+halves of the projections.
+"""
 
 from __future__ import annotations
 
@@ -28,12 +29,12 @@ from recon.post import clusters
 from splatline_structure.materials import F32, Spacing
 
 Box = tuple[slice, slice, slice]
-_BESIDE = 16  # extra slices on both sides of the measured ones, because the prior of a method extends over them
+_BESIDE = 16  # additional slices on both sides of the measured slices, because the prior of a method extends over them
 BYTES_OF_ALL, BYTES_OF_SQUARE, BYTES_BESIDE = 150, 75, 40 * 2 * _BESIDE
 """Peak memory in bytes a voxel of the measured slices, with both halves: if the box is the whole slice (measured: 145
 for percolating particles, 105 for grains), and if it is the square in a circle, at most 41 % of the slice. The third is
 for each voxel of one slice: FISTA-TV also reconstructs `_BESIDE` slices on both sides, at 40 bytes a voxel."""
-_LEAST = 8  # fewest voxels along a side
+_LEAST = 8  # fewest voxels along a side of the box
 _MARGIN = 0.05  # fraction of the square's side left out at each end, so that the wall of a can is outside
 _GOES_ON = 0.5  # if the rim of the field has this fraction of the inner mean, the sample is wider than the field
 
@@ -43,11 +44,11 @@ class ReadSlices:
     """The slices of a volume that were read.
 
     Attributes:
-        record: these slices, lengths in mm.
+        record: the record of these slices, with lengths in mm.
         slices: their indices in the volume.
-        asked: slices that were asked for; `slices` are fewer if not all fit the memory.
+        asked: slices that were requested; `slices` are fewer if not all of them fit into the memory.
         n_slices: number of slices of the whole volume.
-        limit_sentence: message that not all slices fit the memory; empty if they do.
+        limit_sentence: message that not all slices fit into the memory; empty if all fit.
     """
 
     record: Any
@@ -73,10 +74,10 @@ def read_volume(
     """Read the slices of a volume, or as many of them in the middle as fit the memory.
 
     Args:
-        voxel_um: edges of a voxel (z, y, x) in µm; None: as the file states.
+        voxel_um: edges of a voxel (z, y, x) in µm; None: the edges that the file states.
         crop: the crop for `box_in`; with "finite", values outside its circle may be anything.
-        whole: read all slices that are asked for, or raise.
-        warn: prints a warning if the file states other edges.
+        whole: True: read all requested slices, or raise an error.
+        warn: function that gets a warning if the file states other edges.
 
     Raises:
         DataError: the file is not a volume of finite numbers, does not state the voxel size or has no such slices; or
@@ -158,11 +159,11 @@ def _edges(spacing: ArrayLike) -> str:
 def slabs_of(
     path: Path, dataset: str | None, read: ReadSlices, box: Box, tell: Callable[[int, int], None]
 ) -> Iterator[F32]:
-    """The box in all slices that were asked for, in slabs of at most as many slices as were read. Each slab begins with
+    """Yields the box in all requested slices, in slabs of at most as many slices as were read. Each slab begins with
     the last slice of the slab before.
 
     Args:
-        tell: is called with the number of slabs read, and of all slabs.
+        tell: function that is called with the number of slabs read and the number of all slabs.
 
     Raises:
         DataError: some values are not finite.

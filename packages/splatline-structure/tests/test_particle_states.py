@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -14,7 +15,7 @@ from recon import Grid
 from recon.features.reference.particle_states import ReferenceParticles, fit_state, numbers_of, reference_particles
 
 SCENE = States(31, columns=96, rows=32, others=("phantom.size_um=8", "phantom.fill=0.35"))
-OTHER = States(32, columns=96, rows=32, others=SCENE.others)
+OTHER = replace(SCENE, seed=32)
 VIEWS = 45
 
 

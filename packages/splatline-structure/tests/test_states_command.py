@@ -11,13 +11,21 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from bench_states import errors_of
 from state_scenes import PITCH
 from test_particle_states import SCENE, VIEWS, reference, seen, truth
 
+import recon
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import write_volume
 from recon.features.reference.particle_fit import ParticleEstimate
-from recon.features.reference.particle_states import STEPS, ParticleFit, fit_state, numbers_of
+from recon.features.reference.particle_states import (
+    STEPS,
+    ParticleFit,
+    ReferenceParticles,
+    fit_state,
+    numbers_of,
+)
 from splatline_structure import state_pictures, states
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.test_cone_files import INFO, _write
@@ -184,18 +192,30 @@ def test_charge_needs_states(here: Path) -> None:
 
 
 @pytest.mark.slow
-def test_files_of_a_reference_and_a_state_give_the_numbers_of_the_library(here: Path) -> None:
-    """Up to a third of the noise, because the command estimates the rotation axis from the projections.
+def test_files_of_a_reference_and_a_state_give_the_numbers_of_the_library(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The command finds the particles in the volume and the rotation axis in the projections; the numbers are right."""
+    calls = list[tuple[ReferenceParticles, recon.Geometry, ParticleFit]]()
 
-    How accurate the numbers are is tested with the library, see test_particle_states.py.
-    """
+    def fit(given: ReferenceParticles, data: np.ndarray, views: recon.Geometry, *others: Any) -> ParticleFit:
+        np.testing.assert_array_equal(data, lines)
+        calls.append((given, views, fit_state(given, data, views, *others)))
+        return calls[-1][2]
+
+    monkeypatch.setattr(states, "fit_state", fit)
     geometry, lines = SCENE.geometry(VIEWS), SCENE.lines(6, VIEWS)
     written(here / "charged.h5", lines, geometry.angles)
     result = beamline("structure", "--states", "good.h5", "charged.h5", "-o", "out")
     assert result.exit_code == 0, result.output
+    ((own, views, fitted_),) = calls
+    assert len(own.bodies) == len(reference().bodies)
+    assert abs(views.axis_col - geometry.axis_col) < 0.1 and views.pixel_pitch == geometry.pixel_pitch
+    numbers = numbers_of(own, fitted_)
+    found = errors_of(SCENE, own, numbers, 6)
+    assert found.usual.sum() > 8 and abs(found.grey[found.usual].mean()) < 0.6 and found.grey[found.usual].std() < 1.5
     whole = [row for row in rows(here / "out/particles.csv") if row["cut"] == "0"]
-    numbers = numbers_of(reference(), fit_state(reference(), lines, geometry, None))
-    own = np.flatnonzero(~reference().cut)
-    assert len(own) > 8 and [row["verdict"] for row in whole] == [numbers.verdict[k] for k in own]
+    kept = np.flatnonzero(~own.cut)
+    assert [row["verdict"] for row in whole] == [numbers.verdict[k] for k in kept]
     for column, of_library in (("volume_change_percent", numbers.growth), ("grey_change_percent", numbers.grey_change)):
-        np.testing.assert_allclose([float(row[column]) for row in whole], 100 * of_library[own, 0], atol=1.0)
+        np.testing.assert_allclose([float(row[column]) for row in whole], 100 * of_library[kept, 0], atol=0.01)

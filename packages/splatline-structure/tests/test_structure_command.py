@@ -15,7 +15,7 @@ import tifffile
 from can_of_balls import BALLS, MATRIX, can
 from scipy import ndimage
 
-from splatline_structure import command, pictures, volumes
+from splatline_structure import command, measuring, pictures, volumes
 from tests.beamline.cli.small_scan import beamline, left
 
 VOXEL_UM = ("--voxel-um", "10")
@@ -131,7 +131,7 @@ def test_several_volumes_of_which_memory_does_not_hold_one_are_refused_before_an
     """Else other slices of the one would be compared with those of the other."""
     np.save(here / "short.npy", can()[12:28])
     before = left(here)
-    monkeypatch.setattr(command, "measured", None)
+    monkeypatch.setattr(measuring, "measured", None)
     result = beamline("structure", "short.npy", "can.npy", *VOXEL_UM, *options, "--memory", "13.3M")
     assert result.exit_code == 5
     assert (
@@ -167,7 +167,7 @@ def test_without_contrast_in_the_middle_these_slices_are_named(here: Path) -> No
 def test_halves_are_cut_to_the_slices_that_are_measured_or_hold_these_alone(here: Path) -> None:
     np.save(here / "middle.npy", can()[11:28])
     read = volumes.read_volume(Path("can.npy"), None, (10, 10, 10), (11, 28), 10**9, "square")
-    halves = command._parts(Path("can.npy"), read, None, quick=False, parts=(Path("can.npy"), Path("middle.npy")))
+    halves = measuring.halves_in(Path("can.npy"), read, None, quick=False, parts=(Path("can.npy"), Path("middle.npy")))
     for half in halves:
         np.testing.assert_array_equal(half, can()[11:28])
 

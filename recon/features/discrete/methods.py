@@ -16,8 +16,8 @@ from recon.base.empirical import STANDS_STILL
 from recon.base.method import Plain
 from recon.base.setting import Count, NonNegative
 from recon.base.volume import Volume
-from recon.features.discrete.choose import COUNTS, PULLS, MaterialTrial, in_field
-from recon.features.discrete.mixture import MaterialPull, drawn_apart, probabilities, thin_parts, undecided_share
+from recon.features.discrete.choose import COUNTS, WEAK_PULL, MaterialTrial, pull_to
+from recon.features.discrete.mixture import NOISE, probabilities, undecided_share
 from recon.voxels.choice import Prediction, TrialChoice
 from recon.voxels.half_voxels import HalfVoxels
 from recon.voxels.held_out import CHOICE_SWEEPS
@@ -36,8 +36,8 @@ MATERIALS, UNDECIDED, _OF = "materials", "undecided_share", "_of_materials"
 The decisions are the levels in the units of the scan, and the expected share of misclassified voxels (on the wrong side
 of the middle between two levels).
 """
-_REFIT_SWEEPS = 16  # iterations of which error bars make a share
-_TRIALS = 6  # usual number of test reconstructions with levels
+_REFIT_SWEEPS = 16  # number of iterations; error bars make a share of them
+_TRIALS = 7  # usual number of test reconstructions with levels
 
 
 @dataclass(frozen=True)
@@ -45,17 +45,17 @@ class Discrete(HalfVoxels):
     """Discrete tomography: FISTA-TV, then min ½||A x - p||² + μ TV(x) + β Σ φ(x), x >= 0.
 
     φ pulls voxels to a few discrete grey levels, but not partial-volume voxels, which may lie between two levels; see
-    `recon.features.discrete.mixture`. Memory: as `FistaTv`, plus 2 volumes.
+    `recon.features.discrete.mixture`. Memory: as for `FistaTv`, plus 2 volumes.
 
-    Held-out projections choose the number of levels, their values, the factor on the FISTA-TV weight μ,
-    and β. The result is the FISTA-TV
-    volume if discrete levels do not predict the held-out projections significantly better, or if there are too few
-    projections to hold any out. If it starts from a given first volume, the method uses total variation alone.
+    Held-out projections choose the number of levels, their values, and the factor on the FISTA-TV weight μ. The result
+    is the FISTA-TV volume if discrete levels do not predict the held-out projections significantly better, if a weaker
+    pull predicts them better, or if there are too few projections to hold any out. If the method starts from a
+    given first volume, it uses total variation alone.
 
     Attributes:
         iterations: largest number of iterations over all projections, not counting the FISTA-TV iterations before them.
         levels: densities of the materials in 1/mm, ascending; None: found by EM. If no projections can be held out,
-            voxels are pulled weakly to given levels.
+            voxels are pulled weakly to the given `levels`.
         still, half_voxels: as in `FistaTv`.
     """
 
@@ -79,7 +79,9 @@ class Discrete(HalfVoxels):
             raise ValueError(f"levels must be two or more values in ascending order, got {self.levels}")
 
     def refit(self, share: float) -> VoxelMethod:
-        """`EarlyTv` with a part of its iterations: `share` times the number that the calibration of error bars used."""
+        """The method of the refits for error bars: `EarlyTv` with `share` times the number of iterations that was used
+        to calibrate error bars.
+        """
         return EarlyTv(iterations=max(1, round(share * _REFIT_SWEEPS)), allow_negative=self.allow_negative)
 
     @property
@@ -89,15 +91,17 @@ class Discrete(HalfVoxels):
 
     @property
     def refused_sweeps(self) -> int:
-        """Usual number of test iterations after which discrete levels are rejected and PnP-DCT may be tried."""
+        """Usual number of iterations of the tests that reject discrete levels; PnP-DCT may be tried after these
+        tests.
+        """
         return len(COUNTS) * self.usual_sweeps
 
     @classmethod
     def probabilities(cls, volume: Volume, settings: Mapping[str, Any]) -> F32 | None:
         """[material, z, y, x] probability that a voxel belongs to a material, in ascending order of the levels.
 
-        The probabilities of a voxel add up to less than 1. The rest is the probability that it is a partial-volume
-        voxel. None: the volume with these settings was not pulled to discrete levels.
+        The probabilities of a voxel add up to less than 1. The rest is the probability that the voxel is a
+        partial-volume voxel. The result is None if the volume with these settings was not pulled to discrete levels.
         """
         given: list[Any] = [settings.get(name + _OF, ()) for name in MaterialPrior._fields]
         if not len(given[0]):
@@ -107,15 +111,16 @@ class Discrete(HalfVoxels):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """Empty: no time limit can end the method, because it needs all iterations of its tests to find levels."""
+        """Empty, because no time limit can end the method: it needs all iterations of its tests to find levels."""
         return {}
 
     def toy(self) -> Self:
         return replace(self, iterations=1, levels=(0.0, 1.0))
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """How well the best discrete levels predict held-out projections. If there are no such levels: how well total
-        variation predicts them."""
+        """How well the method predicts held-out projections: with the best discrete levels, or with total variation
+        alone if no levels are better.
+        """
         if trial.weight is None:
             return Prediction(
                 self.name, remark=f"{self.name}: not tried, because no weight of total variation could be chosen"
@@ -136,13 +141,14 @@ class Discrete(HalfVoxels):
         x = self.pulled(problem, x, weight, materials, self.first_sweeps)
         if not problem.go_on.going:
             return x
-        pull = partial(_pull_to, materials)
+        pull = partial(pull_to, materials)
         return self.in_half_voxels(problem, x, mu * materials.tv_share, TV_STEPS, pull, self.first_sweeps)
 
     def materials(
         self, problem: VoxelProblem, weight: TvWeight, trial: Callable[[], Trial | None]
     ) -> MaterialPrior | None:
-        """The levels in the units of the problem; None if they do not predict held-out projections. Decided once.
+        """The grey levels in the units of the problem. The result is None if discrete levels do not predict held-out
+        projections better. The levels are found once and then reused.
 
         Args:
             weight: weight of total variation.
@@ -159,9 +165,11 @@ class Discrete(HalfVoxels):
         self, problem: VoxelProblem, x: F32, weight: TvWeight, materials: MaterialPrior, done: int,
         to_the_end: bool = True,
     ) -> F32:  # fmt: skip
-        """The volume x [y, x, z] after `iterations` iterations with a pull to the levels; `done` were made before;
-        `to_the_end` as in `Subsets.of`."""
-        pull, further = _pull_to(materials, problem, x), replace(problem, go_on=problem.go_on.after(done))
+        """Continue from the volume x [y, x, z], with a pull to the grey levels, and return the new volume [y, x, z]. At
+        most `iterations` iterations are made. `done` is the number of iterations that were made before, for the
+        progress. `to_the_end` is explained in `Subsets.of`.
+        """
+        pull, further = pull_to(materials, problem, x), replace(problem, go_on=problem.go_on.after(done))
         count = subsets_of(problem.projector.geometry, SUBSETS if to_the_end else MANY_SUBSETS, to_the_end)
         subsets = Subsets.of(problem, count, to_the_end)
         x = ordered_fista(
@@ -180,7 +188,7 @@ class Discrete(HalfVoxels):
         if trial is None or weight.by_noise:
             levels = self.levels or ()
             weights = tuple(1 / len(levels) for _ in levels)
-            return MaterialPrior(levels, weights, 1.0, PULLS[-1]).scaled(-problem.units.density)
+            return MaterialPrior(levels, weights, 1.0, WEAK_PULL, NOISE).scaled(-problem.units.density)
         return self._choice(trial, weight.value).materials
 
     def _choice(self, trial: Trial, weight: float) -> MaterialTrial:
@@ -189,8 +197,3 @@ class Discrete(HalfVoxels):
         found = MaterialTrial(trial, weight, self.iterations, levels)
         found.choose()
         return found
-
-
-def _pull_to(materials: MaterialPrior, problem: VoxelProblem, x: F32) -> MaterialPull:
-    """The pull of x [y, x, z], the volume of total variation, to these materials in the field of view."""
-    return MaterialPull(drawn_apart(materials), in_field(problem), thin_parts(x, materials))

@@ -138,11 +138,11 @@ def thin_parts(x: F32, materials: MaterialPrior) -> NDArray[np.int8]:
     return thin
 
 
-def table_of(materials: MaterialPrior, noise: float) -> MaterialTable:
-    """The table of these materials for the kernel; `noise` is divided by the gap between levels."""
+def table_of(materials: MaterialPrior) -> MaterialTable:
+    """The table of these materials for the kernel."""
     m, weight = np.array(materials.levels), np.array(materials.weights)
     gaps, spread = np.diff(m), SPREAD * gap_of(materials)
-    variance = (noise * gap_of(materials)) ** 2 + spread**2
+    variance = (materials.noise * gap_of(materials)) ** 2 + spread**2
     beyond = _REACH * math.sqrt(variance)
     values = np.linspace(m[0] - beyond, m[-1] + beyond, _ROWS)
     likelihoods = np.exp(-0.5 * (values[:, None] - m) ** 2 / variance) / math.sqrt(2 * math.pi * variance)
@@ -167,14 +167,12 @@ class MaterialPull:
     Attributes:
         where: [y, x, z] voxels that are pulled.
         thin: [y, x, z], see `thin_parts`.
-        noise: noise of a voxel, divided by the gap between levels.
         follows: True: levels are fitted again to each volume.
     """
 
     materials: MaterialPrior
     where: NDArray[np.bool_]
     thin: NDArray[np.int8]
-    noise: float = NOISE
     follows: bool = False
 
     @property
@@ -192,7 +190,7 @@ class MaterialPull:
 
     def target(self, x: F32) -> F32:
         z = np.empty_like(x)
-        posterior_mean(x, table_of(self.materials_in(x), self.noise), z)
+        posterior_mean(x, table_of(self.materials_in(x)), z)
         for pulled, own, where, thin in zip(z, x, self.where, self.thin, strict=True):
             np.copyto(pulled, own, where=~where | ((pulled - own) * thin > 0))
         return z
@@ -205,5 +203,5 @@ def probabilities(x: F32, materials: MaterialPrior) -> F32:
     % are within a quarter of the gap from that material. Memory: one volume per material, plus one.
     """
     found = np.empty((len(materials.levels), *x.shape), np.float32)
-    posterior_mean(x, table_of(materials, LEAST_NOISE), np.empty_like(x), found)
+    posterior_mean(x, table_of(materials._replace(noise=LEAST_NOISE)), np.empty_like(x), found)
     return found

@@ -72,8 +72,8 @@ class Cgls(VoxelMethod):
     early.
 
     Negative values are clipped at the end. In float32, rounding makes the directions lose conjugacy after about eight
-    iterations. From then on, the method needs one iteration more than it would need in exact arithmetic for the same
-    residual. Memory: 3 volumes and 3 times the projections.
+    iterations. After that, the method is about one iteration behind exact arithmetic. Memory: 3 volumes and 3 times the
+    projections.
     """
 
     name: ClassVar[str] = "cgls"
@@ -85,7 +85,7 @@ class Cgls(VoxelMethod):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """Empty, because more iterations do not improve the volume of this method."""
+        """Empty, because a time limit cannot end this method: more iterations do not improve its volume."""
         return {}
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
@@ -119,7 +119,7 @@ class Cgls(VoxelMethod):
 
 @dataclass(frozen=True)
 class AsdPocs(VoxelMethod):
-    """Adaptive steepest descent of TV, alternating with SART (Sidky & Pan 2008, Phys. Med. Biol. 53, 4777).
+    """Adaptive steepest descent of TV, alternating with SART (Sidky & Pan 2008, PMB 53, 4777).
 
     Each iteration makes one SART iteration, then `tv_steps` steps down the gradient of TV. Each step is `alpha` times
     as long as the change of the first SART iteration. If the steps undo more than `ratio` of the SART iteration, and
@@ -127,10 +127,11 @@ class AsdPocs(VoxelMethod):
     times the projections.
 
     Attributes:
-        goal: relative residual ||A x - p|| / ||p|| at which the TV steps are no longer shortened. None: 0.15 times the
-            residual of filtered back-projection (FBP or FDK). FDK cannot reconstruct a short cone scan. For such a scan
-            the goal is 0.15 times the residual after one iteration of ordered-subset SIRT. Both residuals are similar:
-            0.085 to 0.12 for SIRT, and 0.075 to 0.11 for FDK (a box in a box, 20 to 180 projections, 0 and 2 % noise).
+        goal: relative residual ||A x - p|| / ||p|| at which the TV steps are no longer shortened. If `goal` is None, it
+            is 0.15 times the residual of filtered back-projection (FBP or FDK). FDK cannot reconstruct a short cone
+            scan. For a short cone scan the goal is 0.15 times the residual after one iteration of ordered-subset SIRT.
+            This residual is similar to the residual of FDK. (A box in a box, 20 to 180 projections, 0 and 2 % noise:
+            0.085 to 0.12 for SIRT, 0.075 to 0.11 for FDK.)
     """
 
     name: ClassVar[str] = "asd-pocs"

@@ -25,7 +25,7 @@ from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.voxel_problem import Momentum, TotalVariationProx, difference_weights, largest_eigenvalue
 
 _SUBSETS, _TV_STEPS = 9, 3
-_ROUNDS = 6  # power iterations
+_ROUNDS = 6  # number of power iterations
 # the energies do not separate the materials if a singular value is below this share of the largest one
 _LEAST_SINGULAR = 1e-4
 _NOTHING = 1e-20  # largest singular value that counts as zero: the materials do not attenuate
@@ -88,7 +88,7 @@ class EnergyViews:
         refuse_alike(self.cross_sections[np.unique(self.energy)])
 
     def select(self, views: NDArray[np.intp], rows: slice) -> EnergyViews:
-        """Some projections, and a range of their rows."""
+        """The same data with only these projections, and only these detector rows."""
         first, stop, _ = rows.indices(self.projections.shape[1])
         weight = None if self.weight is None else self.weight[views, rows]
         geometry = self.geometry.select(views).rows(first, stop)
@@ -120,7 +120,7 @@ def trial_rows(views: EnergyViews, grid: Grid, height: int) -> tuple[slice, Grid
 
 
 class StoppedError(Exception):
-    """`stop` interrupted a step."""
+    """The function `stop` interrupted a step."""
 
 
 class _Part(NamedTuple):

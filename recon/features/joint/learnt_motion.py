@@ -170,7 +170,7 @@ def _seen(views: EnergyViews, grid: Grid) -> list[Seen]:
     ]
 
 
-_LEVELS = ((64, 2), (160, 4), (320, 2))  # levels: largest number of columns, and volumes from all projections
+_LEVELS = ((64, 2), (160, 4), (320, 2))  # levels: largest number of columns, and number of volumes from all projections
 _ROWS = 32  # number of binned rows examined
 _VIEWS = 60  # number of projections examined per energy
 # columns by which a magnification moves the outermost pixel; a smaller one is ignored, so that nothing is interpolated
@@ -187,15 +187,16 @@ def register_energies(
     The energy with the most projections is the reference. The volume at the reference energy, scaled by the mean
     absorption at another energy, predicts the projections at that energy. Six parameters explain the differences (see
     `recon.voxels.displacement`): the sample is shifted along x, y and z and rotated about the axis; the image is
-    shifted along the rows and magnified. The edges determine these parameters, so a material whose absorption differs
-    between two energies does no harm.
+    shifted along the rows and magnified. The edges in the projections determine the parameters, so a material whose
+    absorption differs between two energies does no harm.
 
     Returns:
         The projections (interpolated if their magnification differs), and the displacement at each energy. The
         displacement is 0 if a displacement does not predict held-out projections better.
 
     Raises:
-        ValueError: the beam is a cone, in which a shift of the sample changes the directions of its rays.
+        ValueError: the beam is a cone: a shift of the sample then changes the directions of the rays through the
+            sample.
     """
     check_arguments(register_energies, locals())
     moves: list[Displacement] | None = None

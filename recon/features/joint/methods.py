@@ -30,8 +30,8 @@ class TimeSeries(Series):
     Attributes:
         volumes: number of volumes, 2 or more, from the time of the first projection to the time of the last. Each
             volume needs at least twelve projections.
-        moves: True: the sample also moves. False: only densities change. None: held-out projections decide whether it
-            moves.
+        moves: True: the sample also moves; False: only densities change; None: held-out projections decide whether the
+            sample moves.
         sweeps: number of iterations of the fit.
         weight: weight of total variation, `tv_weight` of `fit_series`; None: held-out projections decide.
 

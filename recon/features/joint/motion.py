@@ -23,8 +23,8 @@ from recon.voxels.projector import Projector
 
 A = TypeVar("A", F32, F64)
 
-MIDDLE = 0.5  # the time within the scan at which u is 0
-_STEPS = 8  # conjugate-gradient iterations
+MIDDLE = 0.5  # time within the scan at which u is 0
+_STEPS = 8  # number of conjugate-gradient iterations
 # weight that penalises differences between neighbouring control points, divided by the typical curvature of a control
 # point
 _SMOOTH = 0.03

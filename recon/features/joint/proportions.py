@@ -30,7 +30,7 @@ from recon.voxels.projector import Projector, projection_lines, volume_lines, vo
 
 # first λ, divided by the mean curvature of the projections; ratio of the next λ to it; number of tests
 _HEAVIEST, _LIGHTER, _TRIALS = 32.0, 3.0, 9
-_IN_TIME = 0.03  # τ
+_IN_TIME = 0.03  # the constant τ
 SOLUTION_STEPS, _TRIAL_STEPS = 60, 20  # number of conjugate-gradient iterations of the solution, and of a test
 TRIAL_STEPS = _TRIALS * _TRIAL_STEPS
 """Largest number of iterations of all tests and of the solution together."""
@@ -207,8 +207,8 @@ def fit_share(
         found: result of `fit_materials` from the same projections.
         states: indices of the two materials.
         go_on: function called before each of at most `STEPS` steps, with the number of steps that may still follow. If
-            it returns False, the fit ends with the densities reached so far. stop: function called many times within a
-            step. If it returns True, the fit ends at once, with the densities reached so far.
+            `go_on` returns False, the fit ends with the densities reached so far. stop: function called many times
+            within a step. If `stop` returns True, the fit ends at once, with the densities reached so far.
 
     Raises:
         ValueError: `states` are not two different materials.

@@ -93,10 +93,10 @@ class TimedVolumes:
         grid: grid of each volume.
         residual: norm of the residual of the projections, divided by the norm of the projections.
         motion: for each voxel, the displacement to the place from which the voxel takes its value; None: nothing moves.
-        unseen_residuals: residuals of coarse volumes in held-out projections: without motion, and with motion. None:
+        unseen_residuals: residuals of coarse volumes in held-out projections, without motion and with motion; None if
             held-out projections did not decide about motion.
         smooth: smoothness of the factors (module `proportions`), if each volume is the mean volume multiplied by smooth
-            factors. None: each volume is fitted separately.
+            factors; None if each volume is fitted separately.
     """
 
     times: F64
@@ -143,21 +143,21 @@ def fit_series(
     time, and is the identity in the middle of the scan (module `motion`). Mathematically this is the problem of
     `fit_materials`: knots replace the materials, and hat functions replace the cross sections. z_j are the orthonormal
     components of all volumes x_k; the first one is their common part. If nothing moves, the function also tries the
-    mean volume times smooth factors. It returns these volumes if they predict held-out projections better. Smooth
-    factors suit a sample of particles in which each particle takes up or loses material at its own time. Steps, memory,
-    `go_on` and `stop` are as in `fit_materials`. There are four tests: of the weights, of whether the sample moves, of
-    the motion, and of the factors. During each test, `go_on` gets a countdown that ends at 0. After the iterations,
-    `go_on` gets a countdown of the steps that fit the factors. If you end these steps early, the result is the volumes
-    without factors.
+    mean volume times smooth factors. Volumes with factors are returned if they predict held-out projections better.
+    Smooth factors suit a sample of particles in which each particle takes up or loses material at its own time. Steps,
+    memory, `go_on` and `stop` are as in `fit_materials`. There are four tests: of the weights, of whether the sample
+    moves, of the motion, and of the factors. During each test, `go_on` gets a countdown that ends at 0. After the
+    iterations, `go_on` gets a countdown of the steps that fit the factors. If you end the fit of the factors early, the
+    result is the volumes without factors.
 
     Args:
         knots: number of volumes, 2 or more.
-        motion: True: also estimate the motion. None: use the motion only if it predicts held-out projections better.
+        motion: True: also estimate the motion; None: use the motion only if it predicts held-out projections better.
             Motion helps for a sample that settles. If only the densities of the sample change, the estimate shows
             motion that does not exist.
         tv_weight: μ of all components. The scale is that of one volume: for a sample that does not change, the value
-            has the same effect as the same weight for one volume from all projections. None: the weight that predicts
-            held-out projections best.
+            has the same effect as the same weight for one volume from all projections. If `tv_weight` is None, the
+            weight that predicts held-out projections best is used.
 
     Raises:
         ValueError: a volume has fewer than twelve projections, or fewer than six projections are nearer in time to this

@@ -80,20 +80,21 @@ def fit_materials(
 
     U S Vᵀ is the singular value decomposition of the cross sections (each energy weighted by its number of
     projections). The densities are V S⁻¹ z. U has orthonormal columns. Therefore all components z_k have the same
-    noise, and the fit is as well conditioned as a fit at a single energy. An iteration takes as long as an iteration
-    with the same number of projections at a single energy. The steps are those of `ordered_fista`. After each step,
-    densities below 0 are set to 0. (Long & Fessler 2014, IEEE Trans. Med. Imaging 33, 1614, also fit materials to
-    spectra in one step.) Memory: seven volumes per material, three times the projections.
+    noise, and the fit is as well conditioned as a fit at a single energy. An iteration takes as long as it would for
+    the same number of projections at a single energy. Each iteration makes the steps of `ordered_fista`. After each
+    step, densities below 0 are set to 0. (Long & Fessler 2014, IEEE TMI 33, 1614, also fit materials to spectra in one
+    step.)
+    Memory: seven volumes per material, three times the projections.
 
     Args:
         grid: grid of the volumes; None: the grid of the geometry.
         tv_weight: weight for all components; None: the weights that predict held-out projections best.
         sweeps: number of iterations. An iteration has about nine steps, which use all projections equally often.
         go_on: function called with (iteration, residual) after each iteration. During the test reconstructions for the
-            weights, the first argument is -n; n is the number of iterations that may still follow (`TRIAL_SWEEPS` at
-            most). If it returns False, the fit ends with the volumes reached so far.
-        stop: function called many times within an iteration, from the second step on. If it returns True, the fit ends
-            with the volumes from before the current step.
+            weights, the first argument is -n, where n is the number of iterations that may still follow (at most
+            `TRIAL_SWEEPS`). If `go_on` returns False, the fit ends with the volumes reached so far.
+        stop: function called many times within an iteration, from the second step on. If `stop` returns True, the fit
+            ends with the volumes from before the current step.
     """
     check_arguments(fit_materials, locals())
     warn_of_other_quantity(views.projections)

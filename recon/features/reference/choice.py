@@ -1,8 +1,8 @@
-"""Whether a reference is used: three questions to the held-out projections of a trial.
+"""Decides with three tests on held-out projections whether a reference is used.
 
-Held-out projections favour any prior over none, also a reference that is misplaced. So the reference must predict them
-better than the same total variation without it, better than what `auto` takes without it, and better than copies of
-itself that are displaced by a voxel.
+Any prior predicts held-out projections better than no prior, even a misplaced reference. So the reference must pass
+three tests: it must predict them better than the same total variation without a reference, better than the method that
+`auto` chooses without a reference, and better than copies of the reference that are displaced by a voxel.
 """
 
 from __future__ import annotations
@@ -31,20 +31,21 @@ from recon.voxels.choice import (
 from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem, times_power
 
-MARGIN = 16  # voxels beyond the box up to which the reference is kept, because it may have moved
-_FIRST = 1.4  # first weight of the change, divided by the best weight of total variation
-_FEW = 6  # sweeps with a displaced copy
+MARGIN = 16  # voxels beyond the box in which the reference is also kept, because the sample may have moved
+_FIRST = 1.4  # first weight of the total variation of the change, divided by the best weight of total variation
+_FEW = 6  # iterations with a displaced copy
 
 
 class ReferenceVerdict(NamedTuple):
-    """Whether the reference is used, in plain values (see `Decisions`).
+    """The decision whether the reference is used, as plain values that can be stored (see `Decisions`).
 
     Attributes:
-        used: False: the volume is that of `auto`.
-        because: the residuals in held-out projections, or the question that failed.
-        weight: μ for all projections, in the units of the scan.
-        affine, splines: coefficients of the displacement, in mm: of `Basis.affine` and `Basis.splines`.
-        gains: of the ground and of the particles together.
+        used: True if the reference is used. False: the volume is the one that `auto` makes.
+        because: the residuals in held-out projections, or the test that failed.
+        weight: the weight μ for all projections, in the units of the scan.
+        affine, splines: coefficients of the displacement in mm, for `Basis.affine` and for `Basis.splines`. `affine` is
+            for heights from the middle of the reference, which all slabs of a volume share.
+        gains: gain of the ground, and one gain for all particles.
     """
 
     used: bool
@@ -60,7 +61,9 @@ class ReferenceVerdict(NamedTuple):
 
 
 def not_moved(reference: Volume, problem: VoxelProblem) -> Moved | None:
-    """The reference on the voxels of a problem, before its motion is known; None: it shows no material there."""
+    """The reference on the voxels of a problem, before its motion is known. None: the reference shows no material
+    there.
+    """
     grid = problem.units.projector(problem.projector, 1).grid
     volume, first = placed(reference, grid, MARGIN)
     particles = particles_of(times_power(volume, -problem.units.density))
@@ -73,31 +76,42 @@ def not_moved(reference: Volume, problem: VoxelProblem) -> Moved | None:
 
 
 def width_of(problem: VoxelProblem) -> float:
-    """Width of the field of view, across which motion has its splines, in the units of the problem."""
+    """Width of the field of view, in the units of the problem. The splines of the motion span this width."""
     return 2 * problem.projector.geometry.reach
 
 
+def about_reference(affine: F64, reference: Volume, problem: VoxelProblem, width: float, sign: int = 1) -> F64:
+    """Coefficients of `Basis.affine` for heights from the middle of the reference. With sign -1, the reverse: for
+    heights in the problem."""
+    scale = problem.projector.grid.voxel_size / problem.units.projector(problem.projector, 1).grid.voxel_size
+    c = affine.copy()
+    c[:, 0, 0, 0] += sign * c[:, 0, 0, 1] * 2 * scale * reference.grid.centre[0] / width
+    return c
+
+
 def _at_rows(reference: Volume, trial: Trial) -> Volume:
-    """The reference with z from the middle of the trial's rows, as the trial has it in a parallel beam."""
+    """The reference with z measured from the middle of the trial's rows, as in the trial of a parallel beam."""
     z, y, x = reference.grid.centre
     pitch = trial.problem.units.projector(trial.problem.projector, 1).grid.spacing[0]
     return Volume(reference.data, replace(reference.grid, centre=(z - trial.above * pitch, y, x)))
 
 
 def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerdict:
-    """The three questions, on the rows and projections of a trial; `choice` is that of `auto`.
+    """Make the three tests on the rows and projections of a trial. `choice` is the choice of `auto`.
 
-    In a cone no reference is used: held-out projections favoured one whose volume was up to 2 dB worse than `auto`'s.
+    For a cone beam no reference is used, because held-out projections preferred a reference whose volume was up to 2 dB
+    worse than the volume of `auto`.
     """
     problem, mu = trial.problem, trial.weight
     if problem.projector.geometry.is_cone:
         return ReferenceVerdict(False, "a reference is used only with a parallel beam, and this is a cone")
-    moved = not_moved(_at_rows(reference, trial), problem)
+    reference = _at_rows(reference, trial)
+    moved = not_moved(reference, problem)
     if mu is None or moved is None:
         return ReferenceVerdict(
             False, "the reference shows no material here" if mu else "the weights could not be chosen"
         )
-    mu /= np.sqrt(ONE_IN / (ONE_IN - 1))  # that of the projections that are not held out, see `choose_weight`
+    mu /= np.sqrt(ONE_IN / (ONE_IN - 1))  # weight for the projections that are not held out, see `choose_weight`
     smooth = trial.volume_of_weight(mu) if trial.smooth is None else trial.smooth
     width, grid = width_of(trial.scan), problem.projector.grid
     affine = Basis.affine(grid, width)
@@ -106,8 +120,7 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     beside = np.where(moved.known(), 0, smooth).astype(np.float32)
     moved = affinely_moved(MotionViews.of(problem), moved, affine, beside)
     coefficients, gains = affine.nearest(moved.u) * affine.used, moved.gains[:2].tolist()
-    about_all = coefficients.copy()  # with z from the middle of all rows instead of the trial's
-    about_all[:, 0, 0, 0] -= coefficients[:, 0, 0, 1] * 2 * trial.above * grid.spacing[0] / width
+    about = about_reference(coefficients, reference, problem, width)
     start = np.where(moved.known(), moved.volume(), smooth).astype(np.float32)
     fit = StateFit(problem, moved, start, _FIRST * mu, width)
     fit.rounds(PLAN)
@@ -134,12 +147,12 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     splines = Basis.splines(grid, width, KNOTS)
     bent = splines.nearest(fit.moved.u - padded(affine.field(coefficients)))
     edge = problem.units.projector(problem.projector, 1).grid.voxel_size
-    mm = [(edge * each).ravel().tolist() for each in (about_all, bent.mean(-1, keepdims=True))]
+    mm = [(edge * each).ravel().tolist() for each in (about, bent.mean(-1, keepdims=True))]
     return ReferenceVerdict(True, told, of_scan, mm[0], mm[1], gains)
 
 
 def _best_weight(trial: Trial, fit: StateFit) -> BestStrength | None:
-    """The weight that predicts best with the reference; None: the trials were stopped."""
+    """The weight with which the reference predicts held-out projections best; None: the trials were stopped."""
 
     def residuals_of(weight: float) -> F64:
         other = fit.again(weight, fit.x)
@@ -150,7 +163,7 @@ def _best_weight(trial: Trial, fit: StateFit) -> BestStrength | None:
 
 
 def _without(trial: Trial, fit: StateFit, smooth: F32, mu: float) -> BestStrength | None:
-    """The same for total variation with weights that fall as with the reference, but without it; searched from μ."""
+    """The same without the reference: total variation whose weights fall in the same way. The search starts at μ."""
 
     def residuals_of(weight: float) -> F64:
         other = fit.again(weight, smooth)
@@ -162,7 +175,9 @@ def _without(trial: Trial, fit: StateFit, smooth: F32, mu: float) -> BestStrengt
 
 
 def _better_displaced(trial: Trial, fit: StateFit) -> str | None:
-    """Where a copy of the reference, displaced by a voxel, predicts as well as the reference itself; None: nowhere."""
+    """The direction in which a copy of the reference, displaced by a voxel, predicts as well as the reference itself;
+    None: there is no such direction.
+    """
     own = trial.residuals(fit.x)
     for axis in range(2 if fit.moved.u[2].any() == 0 else 3):
         for step in (-1, 1):

@@ -1,10 +1,11 @@
-"""The volume of a state: what the moved reference explains, and a change that has few edges.
+"""Fits the volume of a state of the sample: the moved reference plus a change that has few edges.
 
     min over x, u, g of  ½ |A x - p|² + μ Σ_i (a_i |D x|_i + b_i |D (x - m(u, g))|_i),    x >= 0
 
-m is the reference, moved by u and with a gain g for each particle. The three are improved in turn: x by
-`ordered_fista`, g by medians of x, u by the views. (Chen, Tang & Leng 2008, Med. Phys. 35, 660; with the motion: Dang
-et al. 2014, Phys. Med. Biol. 59, 4799; weights that fall: Candès, Wakin & Boyd 2008, J. Fourier Anal. Appl. 14, 877.)
+m is the reference, moved by u and with a gain g for each particle. x, g and u are improved one after the other: x by
+`ordered_fista`, g from medians of x, u from the projections. (Chen, Tang & Leng 2008, Med. Phys. 35, 660; with the
+motion: Dang et al. 2014, Phys. Med. Biol. 59, 4799; weights that fall: Candès, Wakin & Boyd 2008, J. Fourier Anal.
+Appl. 14, 877.)
 """
 
 from __future__ import annotations
@@ -27,18 +28,20 @@ from recon.voxels.priors import TvWeight
 from recon.voxels.voxel_problem import VoxelProblem, difference_weights
 
 OWN = 0.3
-"""Weight of total variation of the volume, divided by that of the change."""
-_STEPS = 6  # dual steps of each proximal step; with three, damped steps do not converge
-_EDGE = 0.12  # slope of the moved reference, in levels of particles per voxel, from which a voxel is at an edge
+"""Weight of the total variation of the volume, divided by the weight of the total variation of the change."""
+_STEPS = 6  # dual steps of each proximal step; with three dual steps, damped steps do not converge
+_EDGE = 0.12  # slope of the moved reference, in particle levels per voxel, above which a voxel belongs to an edge
 PLAN: tuple[tuple[tuple[int, float], ...], ...] = (((4, 1), (4, 1)), ((6, 0.5), (6, 0)), ((KNOTS, 0), (KNOTS, 0)))
-"""Rounds: intervals of the splines, and blur in voxels, of each step of the motion."""
-_MOST, _STILL = 12, 2e-3  # sweeps of a volume within the rounds, and its change at which it has converged
+"""The rounds. Each round lists the steps of the motion, with the number of intervals of the splines and the blur in
+voxels.
+"""
+_MOST, _STILL = 12, 2e-3  # iterations of a volume within the rounds, and relative change below which it has converged
 
 
 class TwoVariations:
     """argmin_y ½|y - x|² + threshold Σ_i (a_i |D y|_i + b_i |D (y - m)|_i), y >= 0: the `Prox` of a state.
 
-    The dual fields are kept from one call, and from one m, to the next. Memory: 8 volumes beside m, a and b.
+    The dual fields are kept from one call to the next, also if m changes. Memory: 8 volumes in addition to m, a and b.
     """
 
     def __init__(self, shape: tuple[int, int, int], weights: tuple[float, float, float], nonnegative: bool) -> None:
@@ -48,7 +51,7 @@ class TwoVariations:
         self.m = self.own = self.change = self._start
 
     def copy(self) -> TwoVariations:
-        """The same with dual fields of its own."""
+        """A copy with separate dual fields."""
         other = TwoVariations(self._start.shape, self._weights, self._nonnegative)
         other._fields = self._fields[0].copy(), self._fields[1].copy()
         return other
@@ -72,20 +75,20 @@ class TwoVariations:
             primal(*given)
 
     def turn(self) -> None:
-        """Nothing: the differences stay those to the next voxels."""
+        """Does nothing: the differences are always those to the next voxels."""
 
 
 @dataclass(eq=False)
 class StateFit:
-    """A state whose volume, gains and motion are improved in turn.
+    """The fit of a state: volume, gains and motion are improved one after the other.
 
     Attributes:
         problem: the projections of the state.
-        moved: the reference as it is moved so far.
-        x: the volume so far [y, x, z].
-        weight: μ, that of the total variation of the change.
-        width: of the field in mm (in the units of the problem), across which splines have their intervals.
-        rounds: falling weights, in rounds of the volume.
+        moved: the reference with its present motion and gains.
+        x: the present volume [y, x, z].
+        weight: μ, the weight of the total variation of the change.
+        width: width of the field of view in the units of the problem; the intervals of the splines divide this width.
+        rounds: number of rounds of the volume with weights that fall, see `sharpen`.
     """
 
     problem: VoxelProblem
@@ -106,7 +109,9 @@ class StateFit:
         self.known = self.moved.known()
 
     def again(self, weight: float, x: F32, moved: Moved | None = None) -> StateFit:
-        """The same state with another weight, volume and (if given) place of the reference."""
+        """A copy of the fit with another weight and volume, and with another position of the reference if `moved` is
+        given.
+        """
         other = copy(self)
         other.weight, other.x, other.moved = weight, x.copy(), moved or self.moved
         other._prox = self._prox.copy()
@@ -114,25 +119,25 @@ class StateFit:
         return other
 
     def alone(self) -> None:
-        """Leave the reference out: both weights are then of total variation of x."""
+        """Leave out the reference. Both weights then apply to the total variation of x."""
         self.m, self.known = np.zeros_like(self.m), np.ones_like(self.known)
 
     def solve(
         self, own: F32 | float = 1.0, change: F32 | float = 1.0, still: float = _STILL, most: int = _MOST
     ) -> None:
-        """Improve x; `own` and `change` are factors of the two weights [y, x, z]."""
+        """Improve x. `own` and `change` are factors [y, x, z] on the two weights."""
         if not self.going.going:
             return
         own, change = (np.broadcast_to(np.asarray(w, np.float32), self.x.shape) for w in (own, change))
-        # Where the reference shows nothing, and in the differences to such voxels, all of the weight is that of x.
+        # In voxels that the reference does not show, and in differences to such voxels, both weights apply to x.
         inner = ndi.binary_erosion(self.known, border_value=1)
         a = np.where(inner, np.float32(OWN) * own, np.float32(OWN + 1) * own).astype(np.float32)
         self._prox.about(self.m, a, np.where(inner, change, np.float32(0)).astype(np.float32))
         done = self._done
 
-        def go_on(sweep: int, left: float) -> bool:
+        def go_on(sweep: int, residual: float) -> bool:
             self._done = done + sweep
-            return self.going(self._done, left)
+            return self.going(self._done, residual)
 
         self.x = ordered_fista(
             replace(self.problem, go_on=GoesOn(go_on)), self.x, TvWeight(self.weight), self._subsets, sweeps=most,
@@ -140,10 +145,10 @@ class StateFit:
         )  # fmt: skip
 
     def follow(self, steps: Sequence[tuple[int, float]]) -> None:
-        """Improve the gains by x, then the motion by the views.
+        """Improve the gains from x, then the motion from the projections.
 
-        What x shows beside m has changed and is not explained by motion, except at edges of m: there a motion that was
-        not found yet looks like a change.
+        The difference of x from m counts as a change of the sample and not as motion, except at edges of m, where
+        motion that was not found yet looks like a change.
         """
         self.moved = replace(self.moved, gains=gains_of(self.x, self.moved))
         m, slopes = self.moved.with_slopes(self.moved.at_rest)
@@ -158,7 +163,9 @@ class StateFit:
         self.m, self.known = self.moved.volume(), self.moved.known()
 
     def rounds(self, plan: Sequence[Sequence[tuple[int, float]]], most: int = _MOST) -> None:
-        """Rounds of the volume and of the reference in turn, with at most `most` sweeps each."""
+        """Improve the volume and the motion of the reference alternately, with at most `most` iterations in each
+        round.
+        """
         self.solve(most=most)
         for steps in plan:
             if not self.going.going:
@@ -167,16 +174,19 @@ class StateFit:
             self.solve(most=most)
 
     def sharpen(self, rounds: int, still: float = _STILL, most: int = _MOST) -> None:
-        """Rounds with weights that fall where the change is steep, and along dark lines in particles."""
+        """Improve the volume in rounds in which the weights are lower where the change is steep, and along dark lines
+        in particles.
+        """
         for _ in range(rounds):
             own, change = falling(self.problem, self.moved, self.x, self.m)
             self.solve(own, change, still, most)
 
 
 def gains_of(x: F32, moved: Moved) -> NDArray[np.float64]:
-    """Gains of the ground and of the particles of a volume: medians, which cracks and pores do not move.
+    """The gains of the ground and of the particles in a volume. They are medians, so cracks and pores do not affect
+    them.
 
-    A particle that is gone gets 0.
+    A particle that has disappeared gets 0.
     """
     own, label, gains = moved.particles, moved.labels(), moved.gains.copy()
     ground, above, known = moved.pulled(own.ground), moved.pulled(own.above), moved.known()

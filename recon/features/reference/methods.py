@@ -1,7 +1,8 @@
-"""FromReference: the reconstruction of a state of a sample of which there is a careful scan."""
+"""FromReference: reconstructs a state of a sample with the help of an earlier, careful scan of the same sample."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
@@ -15,7 +16,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import Method, Preview, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
-from recon.features.reference.choice import ReferenceVerdict, asked, not_moved, width_of
+from recon.features.reference.choice import ReferenceVerdict, about_reference, asked, not_moved, width_of
 from recon.features.reference.fit import PLAN, StateFit
 from recon.features.reference.motion import KNOTS, Basis, padded
 from recon.features.reference.particles import require_finite
@@ -27,24 +28,26 @@ from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import Buffers, VoxelProblem, bytes_of, times_power
 
 _ROUNDS = PLAN[2:]
-_FIRST, _SHARPER, _LAST = 8, 2, 12  # most sweeps of a round; rounds with falling weights, most sweeps of each
+# largest number of iterations of a round; rounds with falling weights, and iterations of each
+_FIRST, _SHARPER, _LAST = 8, 2, 12
 _BUFFERS = Buffers(34.0, 3.0, 4.8, filtered=True)
 
 
 @dataclass(frozen=True, eq=False)
 class FromReference(Method):
-    """A state of a sample, from few projections and an earlier, careful volume of the same sample.
+    """Reconstructs a state of a sample from few projections and an earlier, careful volume of the same sample.
 
-    The reference is moved to the state (a turn, a shift, an affine map, then smooth splines, found from the
-    projections), each of its particles gets a gain, and total variation of the volume and of its difference from the
-    moved reference are kept small; see `recon.features.reference.fit`. Held-out projections decide whether the
-    reference is used. If not, or if there are fewer than 16 projections, the volume is exactly that of `otherwise`.
+    The reference is moved to the state: by a rotation and a shift, then by an affine map, then by smooth splines, which
+    are all found from the projections. Each particle of the reference gets a gain. The fit keeps two total variations
+    small: that of the volume, and that of its difference from the moved reference; see `recon.features.reference.fit`.
+    Held-out projections decide whether the reference is used. If it is not used, or if there are fewer than 16
+    projections, the volume is exactly the volume of the method `otherwise`.
 
-    Memory: 34 volumes and 3 times the projections.
+    Memory: 34 volumes, 3 times the projections and the reference.
 
     Attributes:
-        reference: the earlier volume, in 1/mm, in the frame of its own scan; None: there is none.
-        otherwise: the method if the reference is not used.
+        reference: the earlier volume, in 1/mm, in the coordinates of its own scan; None: there is no reference.
+        otherwise: the method that is used if the reference is not.
     """
 
     name: ClassVar[str] = "from-reference"
@@ -62,12 +65,12 @@ class FromReference(Method):
             require_finite(self.reference)
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        """The volume with its change, or that of `otherwise`; the settings say which of the two, and why.
+        """The volume with its change from the reference, or the volume of `otherwise`. The settings state which of the
+        two it is, and why.
 
         Raises:
-            ValueError: the reference is elsewhere, or no method can use these projections.
+            ValueError: the reference and the volume have no place in common, or no method can use these projections.
         """
-        in_slabs = control.decide is not None  # only slabs share their decisions, and none knows its height
         decide, trials = control.decide or Decisions(problem.seed), list[Trial | None]()
         control = replace(control, decide=decide)
 
@@ -77,27 +80,25 @@ class FromReference(Method):
             return choice
 
         choice = TrialChoice.of(decide("method", compared))
-        verdict = ReferenceVerdict.of(decide("reference", lambda: self._asked(choice, trials, in_slabs)))
-        if verdict.used:
-            return self._from_reference(verdict, problem, control)
+        verdict = ReferenceVerdict.of(decide("reference", lambda: self._asked(choice, trials)))
+        if verdict.used and (of_reference := self._from_reference(verdict, problem, control)) is not None:
+            return of_reference
         made = self.otherwise.run_chosen(choice, problem, control)
         settings = {**made.settings, "reference_used": False, "reference_because": verdict.because}
         return replace(made, settings=settings, chosen=f"The reference was not used: {verdict.because}. {made.chosen}")
 
-    def _asked(self, choice: TrialChoice, trials: list[Trial | None], in_slabs: bool) -> ReferenceVerdict:
+    def _asked(self, choice: TrialChoice, trials: list[Trial | None]) -> ReferenceVerdict:
         trial = trials[0] if trials else None
         if trial is None or trial.settings.all_rows:
             return ReferenceVerdict(False, f"whether it helps cannot be tested ({choice.where})")
         if self.reference is None:
             return ReferenceVerdict(False, "none was given")
-        if in_slabs:
-            return ReferenceVerdict(
-                False,
-                "this volume is made in slabs, and a reference needs all of it in memory; allow more memory",
-            )
         return asked(trial, choice, self.reference)
 
-    def _from_reference(self, verdict: ReferenceVerdict, problem: ReconProblem, control: RunControl) -> Reconstruction:
+    def _from_reference(
+        self, verdict: ReferenceVerdict, problem: ReconProblem, control: RunControl
+    ) -> Reconstruction | None:
+        """The volume with the reference; None: this part of a volume is where the reference shows no material."""
         assert self.reference is not None and control.decide is not None
         begin, history = control.now(), list[Progress]()
         planned = (1 + len(_ROUNDS)) * _FIRST + _SHARPER * _LAST
@@ -113,6 +114,8 @@ class FromReference(Method):
             state, projector, problem.views.masked(), nonnegative=not self.allow_negative,
             go_on=watched(control, problem.geometry.n_views, report=report), decide=decide,
         )  # fmt: skip
+        if not state.moved.size:
+            return None
         settings = {
             **decide.record, "seed": problem.seed, "reference_used": True, "reference_because": verdict.because,
             "reference_weight": verdict.weight,
@@ -123,26 +126,37 @@ class FromReference(Method):
         )  # fmt: skip
 
     def preview(self, views: Views) -> Preview | None:
-        """The moved reference plus FBP of what it leaves, on the voxels of these projections, see `preview_of`."""
+        """The moved reference plus FBP of its residual, on the voxels of these projections; see `preview_of`."""
         return None if self.reference is None else preview_of(self.reference, views)
 
+    def at_height(self, above: float) -> Self:
+        """With the reference at its height in a part of the volume."""
+        if self.reference is None:
+            return self
+        z, y, x = self.reference.grid.centre
+        return replace(
+            self, reference=replace(self.reference, grid=replace(self.reference.grid, centre=(z - above, y, x)))
+        )
+
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """As for `otherwise`."""
+        """The same as for `otherwise`."""
         return replace(self, otherwise=self.otherwise.with_quality(quality, default_count))
 
     def toy(self) -> Self:
         return replace(self, otherwise=self.otherwise.toy())
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        return max(bytes_of(_BUFFERS, geometry, grid, weighted), self.otherwise.memory(geometry, grid, weighted))
+        own = 0 if self.reference is None else self.reference.data.nbytes
+        return own + max(bytes_of(_BUFFERS, geometry, grid, weighted), self.otherwise.memory(geometry, grid, weighted))
 
 
 class _State:
-    """The iterations from a verdict to the volume; after them, the moved reference and the displacement.
+    """Makes the volume after a verdict. Afterwards it also has the moved reference and the displacement.
 
     Attributes:
-        moved: [z, y, x] in 1/mm.
-        displacement: [axis z, y, x; z, y, x] in mm, from where each voxel takes its value of the reference.
+        moved: [z, y, x] in 1/mm; empty if the reference shows no material here.
+        displacement: [axis z, y, x; z, y, x] in mm, from a voxel to the place in the reference from which it takes its
+            value.
     """
 
     def __init__(self, reference: Volume, verdict: ReferenceVerdict) -> None:
@@ -150,15 +164,19 @@ class _State:
         self.moved = self.displacement = np.empty(0, np.float32)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        moved = not_moved(self._reference, problem)
+        moved = None
+        with suppress(ValueError):  # a part of a volume that goes on above or below the reference
+            moved = not_moved(self._reference, problem)
+        if moved is None:
+            return x
         grid, width, verdict = problem.projector.grid, width_of(problem), self._verdict
         edge = problem.units.projector(problem.projector, 1).grid.voxel_size
-        assert moved is not None
         for basis, values in (
             (Basis.affine(grid, width), verdict.affine),
             (Basis.splines(grid, width, KNOTS).uniform_along_z(), verdict.splines),
         ):
             c = np.reshape(values, (-1, *basis.used.shape)) / edge
+            c = c if basis.intervals else about_reference(c, self._reference, problem, width, -1)
             moved = replace(moved, u=moved.u + padded(replace(basis, axes=len(c)).field(c)))
         gains = np.full(moved.gains.shape, verdict.gains[1])
         gains[0] = verdict.gains[0]

@@ -1,9 +1,10 @@
-"""How a reference has moved until a state was scanned: an affine map, then cubic splines, estimated from the views.
+"""Estimates from the projections how the sample has moved between the reference and a state: an affine map, then cubic
+splines.
 
     m(r) = v(r + u(r)),    u = Σ_c B_c a_c
 
-v is the reference with a gain for each particle. Each step of Gauss-Newton fits the projected derivatives of m to what
-the views show beside it (Leclerc, Roux & Hild 2015, Exp. Mech. 55, 275).
+v is the reference with a gain for each particle. Each Gauss-Newton step fits the projected derivatives of m to the
+residual of the projections (Leclerc, Roux & Hild 2015, Exp. Mech. 55, 275).
 """
 
 from __future__ import annotations
@@ -24,17 +25,18 @@ from recon.kernels.cpu.spline_warp import coefficients, pull
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem
 
-_TALL = 8  # slices from which on the motion along the axis is estimated; with fewer, it is taken for 0
-_VIEWS = 40  # most projections from which the motion is estimated
-_TURNS = np.radians(np.arange(-3.75, 3.8, 0.75))  # turns about the axis that are tried first
-_MOST = 16  # least shift in voxels that is tried first; a tenth of the width if that is more
-_ACROSS = 96  # largest number of voxels across with which they are tried
-_BAND = 2.5, 10.0  # widths in voxels of the Gaussians between which structure is compared
-_BLURS = 4, 4, 2, 1, 1  # voxels, of the steps towards the affine map
-_STEPS, _AFFINE_STEPS = 10, 6  # conjugate-gradient iterations of each, for splines and for an affine map
-_BENDING = 160  # columns for which the weight of bending is stated
+# smallest number of slices with which the motion along the axis is estimated; with fewer slices it is assumed to be 0
+_TALL = 8
+_VIEWS = 40  # largest number of projections from which the motion is estimated
+_TURNS = np.radians(np.arange(-3.75, 3.8, 0.75))  # rotations about the axis that are tried first
+_MOST = 16  # largest shift in voxels that is tried first; a tenth of the width if that is larger
+_ACROSS = 96  # largest number of voxels across, with which rotations and shifts are tried
+_BAND = 2.5, 10.0  # widths of two Gaussians in voxels; structure between these widths is compared
+_BLURS = 4, 4, 2, 1, 1  # blur in voxels of the steps towards the affine map
+_STEPS, _AFFINE_STEPS = 10, 6  # conjugate-gradient iterations of a step, for splines and for an affine map
+_BENDING = 160  # number of columns for which the weight of bending is stated
 KNOTS = 8
-"""Intervals of the finest splines across the field."""
+"""Number of intervals of the finest splines across the field of view."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +45,9 @@ class Basis:
 
     Attributes:
         y, x, z: functions along each axis, [place, function].
-        used: [p, q, r], 1 for the products of functions that are used.
-        axes: 2: in the plane of the slices; 3: also along the axis.
-        intervals: of the splines; 0: no splines, and nothing to bend.
+        used: [p, q, r], 1 if the product of the functions p, q and r is used, otherwise 0.
+        axes: 2: displacements in the plane of the slices; 3: also along the rotation axis.
+        intervals: number of intervals of the splines; 0: there are no splines, so nothing can bend.
     """
 
     y: F64
@@ -57,8 +59,10 @@ class Basis:
 
     @classmethod
     def affine(cls, grid: Grid, width: float) -> Basis:
-        """1, y, x and z, with coordinates from the rotation axis divided by half of `width` (mm)."""
-        z, y, x = (np.stack((at**0, 2 * at / width), axis=1) for at in grid.coordinates())
+        """The functions 1, y, x and z of an affine map. Coordinates are relative to the rotation axis, divided by half
+        of `width` (mm).
+        """
+        z, y, x = (np.stack((coordinate**0, 2 * coordinate / width), axis=1) for coordinate in grid.coordinates())
         used = (np.add.outer(np.add.outer(np.arange(2), np.arange(2)), np.arange(2)) <= 1).astype(float)
         if grid.shape[0] < _TALL:
             used[:, :, 1] = 0
@@ -66,12 +70,14 @@ class Basis:
 
     @classmethod
     def splines(cls, grid: Grid, width: float, intervals: int) -> Basis:
-        """Cubic B-splines with this number of intervals across `width` (mm); as wide along z, at least constant."""
+        """Cubic B-splines with this number of intervals across `width` (mm). Intervals along z have the same length; in
+        a thin volume the functions are constant along z.
+        """
         edge = width / intervals
         z, y, x = grid.coordinates()
         along = round(grid.shape[0] * grid.spacing[0] / edge)
         functions = np.ones((z.size, 1)) if along < 2 else _splines(z - z.mean(), edge, along)
-        rows, cols = (_splines(at, edge, intervals) for at in (y, x))
+        rows, cols = (_splines(coordinate, edge, intervals) for coordinate in (y, x))
         used = np.ones((intervals + 3, intervals + 3, functions.shape[1]))
         return cls(rows, cols, functions, used, 2 + (grid.shape[0] >= _TALL), intervals)
 
@@ -80,7 +86,7 @@ class Basis:
         return (self.axes, *self.used.shape)
 
     def field(self, c: F64) -> F32:
-        """The displacement [axis, y, x, z]."""
+        """The displacement [axis, y, x, z] for these coefficients."""
         wide = np.einsum("yp,apqr->ayqr", self.y, c * self.used).astype(np.float32)
         wide = np.einsum("xq,ayqr->ayxr", self.x.astype(np.float32), wide)
         return np.ascontiguousarray(wide @ self.z.T.astype(np.float32))
@@ -95,7 +101,7 @@ class Basis:
         return replace(self, z=np.ones((len(self.z), 1)), used=np.ones((*self.used.shape[:2], 1)))
 
     def squared(self) -> Basis:
-        """The basis of the squares of the functions."""
+        """The basis whose functions are the squares of these functions."""
         return replace(self, y=self.y**2, x=self.x**2, z=self.z**2)
 
     def bending(self, c: F64) -> F64:
@@ -114,9 +120,9 @@ class Basis:
         return np.einsum("py,qx,rz,ayxz->apqr", y, x, z, u[: self.axes], optimize=True)
 
 
-def _splines(at: F64, edge: float, intervals: int) -> F64:
+def _splines(coordinate: F64, edge: float, intervals: int) -> F64:
     """Cubic B-splines [place, function] on intervals as long as `edge`, around 0."""
-    t = np.abs(at[:, None] / edge - (np.arange(intervals + 3) - (intervals + 2) / 2))
+    t = np.abs(coordinate[:, None] / edge - (np.arange(intervals + 3) - (intervals + 2) / 2))
     return np.where(t < 1, 2 / 3 - t**2 + t**3 / 2, np.maximum(2 - t, 0) ** 3 / 6)
 
 
@@ -125,10 +131,11 @@ class Moved:
     """A reference moved to a state.
 
     Attributes:
-        particles: its parts; `first` is the voxel of them at voxel 0 of the state.
-        u: displacement [3, y, x, z]: from where each voxel of the state takes its value, in voxels.
-        gains: of the ground, then of each particle. Voxels beside particles have the median gain of particles.
-        radius: how far the reference is known around the axis, in voxels.
+        particles: the parts of the reference; `first` is the voxel of the reference at voxel 0 of the state.
+        u: displacement [3, y, x, z] in voxels, from a voxel of the state to the place from which it takes its value.
+        gains: gain of the ground, then of each particle. Voxels next to particles have the median gain of the
+            particles.
+        radius: distance from the axis, in voxels, up to which the reference is known.
     """
 
     particles: Particles
@@ -150,7 +157,7 @@ class Moved:
         return self.with_slopes(volume, False)[0]
 
     def with_slopes(self, volume: F32, slopes: bool = True) -> tuple[F32, F32 | None]:
-        """As `pulled`, and its derivatives [3, y, x, z] with respect to u."""
+        """The same as `pulled`, and the derivatives [3, y, x, z] of the result with respect to u."""
         out = np.empty(self.u.shape[1:], np.float32)
         derivatives = np.empty_like(self.u) if slopes else None
         pull(coefficients(volume), self.u, self.first, out, derivatives)
@@ -158,25 +165,27 @@ class Moved:
 
     def _places(self) -> list[F32]:
         places = []
-        for axis, (at, n) in enumerate(zip(self.first, self.u.shape[1:], strict=True)):
-            own = (np.arange(n, dtype=np.float32) + at).reshape([-1 if a == axis else 1 for a in range(3)])
+        for axis, (start, n) in enumerate(zip(self.first, self.u.shape[1:], strict=True)):
+            own = (np.arange(n, dtype=np.float32) + start).reshape([-1 if a == axis else 1 for a in range(3)])
             places.append(own + self.u[axis])
         return places
 
     def labels(self) -> np.ndarray:
         """The particle of each voxel [y, x, z] of the state."""
         label = self.particles.label
-        nearest = (np.rint(at).astype(int).clip(0, n - 1) for at, n in zip(self._places(), label.shape, strict=True))
+        nearest = (
+            np.rint(place).astype(int).clip(0, n - 1) for place, n in zip(self._places(), label.shape, strict=True)
+        )
         return label[tuple(nearest)]
 
     def known(self) -> np.ndarray:
-        """[y, x, z] whether the reference shows the place of each voxel of the state."""
+        """bool [y, x, z], True for voxels of the state whose place is inside the known part of the reference."""
         places, shape = self._places(), self.particles.label.shape
         inside = np.ones(self.u.shape[1:], bool)
-        for at, n in zip(places, shape, strict=True):
-            inside &= (at > -0.5) & (at < n - 0.5)
+        for place, n in zip(places, shape, strict=True):
+            inside &= (place > -0.5) & (place < n - 0.5)
         if self.radius < math.inf:
-            y, x = (at - (n - 1) / 2 for at, n in zip(places[:2], shape[:2], strict=True))
+            y, x = (place - (n - 1) / 2 for place, n in zip(places[:2], shape[:2], strict=True))
             inside &= np.hypot(y, x) < self.radius
         return inside
 
@@ -187,7 +196,7 @@ class Moved:
 
 @dataclass(frozen=True, eq=False)
 class MotionViews:
-    """The projections from which the motion is estimated: at most 40 of a problem."""
+    """The projections from which the motion is estimated: at most 40 projections of a problem."""
 
     projector: Projector
     lines: F32
@@ -205,14 +214,15 @@ class MotionViews:
 
 
 def improved(views: MotionViews, moved: Moved, basis: Basis, blur: float, beside: F32, with_gains: bool) -> Moved:
-    """The reference after a step of Gauss-Newton towards the views, both blurred by `blur` voxels in the plane.
+    """The reference after a Gauss-Newton step towards the projections. Reference and projections are blurred by `blur`
+    voxels in the plane of the slices.
 
-    A bend of a voxel over an eighth of the field costs as much as the mean residual of a ray, so that the splines
-    relax as the fit improves.
+    Bending by a voxel over an eighth of the field of view costs as much as the mean residual of a ray. Therefore the
+    splines get softer as the fit improves.
 
     Args:
-        beside: a volume [y, x, z] that the views show in addition to the moved reference.
-        with_gains: True: also one gain of the ground and one of all particles.
+        beside: a volume [y, x, z] that the projections show in addition to the moved reference.
+        with_gains: True: also fit one gain of the ground and one gain of all particles.
     """
 
     def smooth(volume: F32) -> F32:
@@ -224,12 +234,12 @@ def improved(views: MotionViews, moved: Moved, basis: Basis, blur: float, beside
     slopes = slopes[: basis.axes] * known
     parts = [moved.pulled(smooth(part)) * known for part in (own.ground, own.above)] if with_gains else []
     lines = views.lines - views.projector.forward_lines(beside) if beside.any() else views.lines
-    left = ndi.gaussian_filter1d(lines, blur, axis=1) if blur else lines
-    left = left - views.projector.forward_lines(now * known)
-    n, n_views = slopes.shape[2], len(left)
+    residual = ndi.gaussian_filter1d(lines, blur, axis=1) if blur else lines
+    residual = residual - views.projector.forward_lines(now * known)
+    n, n_views = slopes.shape[2], len(residual)
     kept, size = basis.squared().back(slopes**2), math.prod(basis.shape)
     share = 1.0 if views.weight is None else float(views.weight.mean())
-    stiff = float(views.weighed(left**2).mean()) * ((basis.intervals / KNOTS) ** 2 * _BENDING / n) ** 2
+    stiff = float(views.weighed(residual**2).mean()) * ((basis.intervals / KNOTS) ** 2 * _BENDING / n) ** 2
 
     def forward(v: F64) -> F32:
         change = np.einsum("ayxz,ayxz->yxz", slopes, basis.field(v[:size].reshape(basis.shape)))
@@ -250,7 +260,7 @@ def improved(views: MotionViews, moved: Moved, basis: Basis, blur: float, beside
     of_u = share * 4 * kept + 6 * stiff / n_views
     scale = np.concatenate((of_u.ravel(), [share * float(np.square(part).sum()) * n / 4 for part in parts]))
     step = _conjugate(
-        normal, back(views.weighed(left)), n_views * scale + 1e-12, _STEPS if basis.intervals else _AFFINE_STEPS
+        normal, back(views.weighed(residual)), n_views * scale + 1e-12, _STEPS if basis.intervals else _AFFINE_STEPS
     )
     u, gains = moved.u.copy(), moved.gains.copy()
     u[: basis.axes] += basis.field(step[:size].reshape(basis.shape))
@@ -278,9 +288,10 @@ def _conjugate(normal: Callable[[F64], F64], right: F64, scale: F64, steps: int)
 
 
 def roughly_moved(moved: Moved, x: F32, grid: Grid, width: float) -> F64:
-    """Coefficients of `Basis.affine` for a turn about the axis and a shift: the best correlation with a volume x.
+    """Coefficients of `Basis.affine` for the rotation about the axis and the shift with which the reference correlates
+    best with a volume x.
 
-    Both volumes are compared between two widths of Gaussians, so that neither levels nor noise count.
+    Both volumes are filtered by the difference of two Gaussians, so that neither levels nor noise count.
     """
     basis, factor = Basis.affine(grid, width), math.ceil(x.shape[1] / _ACROSS)
     still = replace(moved, u=np.zeros_like(moved.u))
@@ -299,17 +310,19 @@ def roughly_moved(moved: Moved, x: F32, grid: Grid, width: float) -> F64:
         c = _turned(basis, turn, (0.0, 0.0, 0.0), width / grid.voxel_size)
         there = replace(still, u=padded(basis.field(c)))
         product = fft.irfftn(target * np.conj(fft.rfftn(band(there.pulled(reference)))), s=band(x).shape)
-        at = [np.arange(-m, m + 1) for m in (most, most, along)]
-        some = product[np.ix_(*at)]
+        offsets = [np.arange(-m, m + 1) for m in (most, most, along)]
+        some = product[np.ix_(*offsets)]
         j, i, k = np.unravel_index(some.argmax(), some.shape)
-        shift = (-factor * float(at[0][j]), -factor * float(at[1][i]), -float(at[2][k]))
+        shift = (-factor * float(offsets[0][j]), -factor * float(offsets[1][i]), -float(offsets[2][k]))
         if some.max() > best[0]:
             best = float(some.max()), _turned(basis, turn, shift, width / grid.voxel_size)
     return np.asarray(best[1])
 
 
 def _turned(basis: Basis, turn: float, shift: Sequence[float], across: float) -> F64:
-    """Coefficients of a turn about the axis after a shift (y, x, z), both in voxels; `across` voxels in the width."""
+    """Coefficients of a shift (y, x, z) in voxels, followed by a rotation about the axis. `across` is the width in
+    voxels.
+    """
     c = np.zeros(basis.shape)
     cos, sin, half = math.cos(turn), math.sin(turn), across / 2
     dy, dx, dz = shift
@@ -322,12 +335,14 @@ def _turned(basis: Basis, turn: float, shift: Sequence[float], across: float) ->
 
 
 def affinely_moved(views: MotionViews, moved: Moved, basis: Basis, beside: F32) -> Moved:
-    """The reference after steps on an affine map and two gains, from coarse to fine; arguments as of `improved`."""
+    """The reference after steps on an affine map and two gains, from coarse to fine. The arguments are those of
+    `improved`.
+    """
     for blur in _BLURS:
         moved = improved(views, moved, basis, blur, beside, True)
     return moved
 
 
 def padded(u: F32) -> F32:
-    """A displacement [3, y, x, z]; 0 along axes that it lacks."""
+    """The displacement with three axes, [3, y, x, z]. It is 0 along an axis that `u` does not have."""
     return np.concatenate((u, np.zeros((3 - len(u), *u.shape[1:]), np.float32)))

@@ -1,10 +1,11 @@
-"""Particles of a reference in the projections of a state: grey level, growth and shift of each by least squares.
+"""Fits the particles of a reference to the projections of a state: grey level, growth and shift of each particle, by
+least squares.
 
     min over g, s, c of  ½ |A m - p|²_W,    m(r) = rest(r) + Σ_k g_k a_k(c_k0 + Rᵀ (r - c_k) / s_k)
 
-a_k is what particle k has above the level around it, in the reference; `rest` is everything else, moved with the whole
-sample. Each round of Gauss-Newton solves the linear problem by conjugate gradients. No volume of the state is
-reconstructed, so that few projections suffice (Leclerc, Roux & Hild 2015, Exp. Mech. 55, 275, for displacements).
+a_k is the excess of particle k over the level around it, in the reference. `rest` is everything else, moved with the
+whole sample. Each Gauss-Newton round solves the linear problem by conjugate gradients. No volume of the state is
+reconstructed, so few projections suffice (Leclerc, Roux & Hild 2015, Exp. Mech. 55, 275, for displacements).
 """
 
 from __future__ import annotations
@@ -20,14 +21,14 @@ from scipy import fft, ndimage
 from recon.base.arrays import F32, F64
 from recon.voxels.projector import Projector
 
-UNKNOWNS = 5  # of a particle: gain, growth of its diameter, shift along y, x and z
+UNKNOWNS = 5  # unknowns of a particle: gain, growth of the diameter, shift along y, x and z
 MEASURED = np.vstack((np.eye(UNKNOWNS), (1, 3, 0, 0, 0)))
-"""The unknowns, and the change of the mass: of the gain and of the volume."""
-_PRIOR = 1.0, 0.1, 3.0, 3.0, 3.0  # standard deviations of the unknowns, far wider than what is expected
-_LARGEST = 1.0, 0.05, 1.5, 1.5, 1.5  # largest step of a round
+"""The unknowns, and the change of the mass, which follows from the gain and the growth."""
+_PRIOR = 1.0, 0.1, 3.0, 3.0, 3.0  # standard deviations of the unknowns, much larger than what is expected
+_LARGEST = 1.0, 0.05, 1.5, 1.5, 1.5  # largest step of an unknown in a round
 _HALVES = 25  # iterations with half of the projections
-_CRACK = 8  # iterations for what particles with a crack show beside their shape
-_SOLID = 0.5  # share of its level from which a voxel is inside a particle
+_CRACK = 8  # iterations for the excess of cracked particles that their shape does not explain
+_SOLID = 0.5  # share of a particle's level above which a voxel is inside the particle
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +36,12 @@ class Body:
     """A particle of the reference.
 
     Attributes:
-        number: its label.
-        spline: coefficients of a cubic spline through what it has above the level around it [y, x, z].
-        first: of the reference's voxels, at voxel 0 of the spline.
-        centre: (y, x, z) in voxels of the reference.
-        level: mean of what it has above the level around it, away from its surface, in the unit of the volume.
-        squares: sum of the squares of what it has above the level around it.
+        number: label of the particle.
+        spline: [y, x, z], coefficients of a cubic spline through the excess of the particle over the level around it.
+        first: voxel of the reference at voxel 0 of the spline.
+        centre: centre (y, x, z) in voxels of the reference.
+        level: mean excess over the level around the particle, away from its surface, in the unit of the volume.
+        squares: sum of the squares of this excess.
     """
 
     number: int
@@ -53,15 +54,15 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class ParticleEstimate:
-    """Where the particles of a reference are in a state.
+    """The estimated positions, sizes and gains of the particles in a state.
 
     Attributes:
-        gain: [particle], 1: as in the reference.
+        gain: [particle], 1 means unchanged from the reference.
         scale: [particle], factor of the diameter.
-        place: [particle, (y, x, z)] in voxels of the state.
-        turn: rotation that all share, [3, 3].
-        rest: change of the gain of all that is no particle.
-        sharper: multiple of the negative Laplacian of all particles that is added, in voxels².
+        place: [particle, (y, x, z)], position in voxels of the state.
+        turn: [3, 3], the rotation of all particles.
+        rest: change of the gain of everything that is not a particle.
+        sharper: factor, in voxels², on the negative Laplacian of the particles that is added to them.
     """
 
     gain: F64
@@ -77,9 +78,10 @@ class Patch:
     """A particle in a state.
 
     Attributes:
-        box: of the voxels of the state.
-        columns: [5, y, x, z] derivatives with respect to its unknowns. The first is its shape with a gain of 1.
-        laplacian: of its shape, negative.
+        box: the box of voxels of the state that contains the particle.
+        columns: [5, y, x, z], derivatives with respect to the unknowns of the particle. The first one is the particle
+            with a gain of 1.
+        laplacian: negative Laplacian of the particle.
     """
 
     box: tuple[slice, slice, slice]
@@ -88,7 +90,7 @@ class Patch:
 
 
 def patch_of(body: Body, gain: float, scale: float, place: F64, turn: F64, shape: Sequence[int]) -> Patch | None:
-    """The particle in a state, on the voxels (y, x, z) of a volume of this shape; None: it lies outside."""
+    """The particle in a state, on the voxels of a volume of this shape (y, x, z). None: the particle lies outside."""
     half = np.array(body.spline.shape) / 2
     reach = scale * (np.abs(turn) @ half) + 1
     middle = place + scale * turn @ (body.first + half - 0.5 - body.centre)
@@ -96,7 +98,7 @@ def patch_of(body: Body, gain: float, scale: float, place: F64, turn: F64, shape
     high = np.minimum(np.ceil(middle + reach).astype(int) + 1, shape)
     if (high - low < 1).any():
         return None
-    wide_low, wide = low - 1, high - low + 2  # a voxel more on each side, for the slopes
+    wide_low, wide = low - 1, high - low + 2  # one more voxel on each side, for the slopes
     matrix = turn.T / scale
     offset = body.centre - body.first + matrix @ (wide_low - place)
     wider = ndimage.affine_transform(
@@ -107,9 +109,9 @@ def patch_of(body: Body, gain: float, scale: float, place: F64, turn: F64, shape
         (np.roll(wider, -1, axis) - np.roll(wider, 1, axis))[1:-1, 1:-1, 1:-1] / 2 for axis in range(3)
     ])  # fmt: skip
     laplacian = 6 * shown - sum(np.roll(wider, s, axis)[1:-1, 1:-1, 1:-1] for axis in range(3) for s in (-1, 1))
-    at = [(np.arange(a, b) - c).reshape([-1 if i == axis else 1 for i in range(3)])
+    distances = [(np.arange(a, b) - c).reshape([-1 if i == axis else 1 for i in range(3)])
           for axis, (a, b, c) in enumerate(zip(low, high, place, strict=True))]  # fmt: skip
-    growth = -sum(away * slope for away, slope in zip(at, slopes, strict=True)) / scale
+    growth = -sum(away * slope for away, slope in zip(distances, slopes, strict=True)) / scale
     columns = np.concatenate((shown[None], gain * growth[None], -gain * slopes)).astype(np.float32)
     box = tuple(slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))
     return Patch((box[0], box[1], box[2]), columns, laplacian.astype(np.float32))
@@ -120,12 +122,12 @@ class StateViews:
     """The projections of a state.
 
     Attributes:
-        projector: of the volume [y, x, z] of the state; lines are [view, col, row].
+        projector: projector of the volume [y, x, z] of the state; its lines are [view, col, row].
         lines: line integrals.
-        weight: of each ray; 0: it is not used.
-        rest: what is no particle [y, x, z], where it is in this state.
-        smooth: the same without its noise; its gain is an unknown.
-        known: [z] slices that are seen, and known from the reference.
+        weight: weight of each ray; 0: the ray is not used.
+        rest: [y, x, z], everything that is not a particle, at its position in this state.
+        smooth: the same without noise; its gain is an unknown.
+        known: [z], True for slices that the projections show and the reference contains.
     """
 
     projector: Projector
@@ -146,19 +148,19 @@ class StateViews:
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """The problem about an estimate: unknowns are [particle, 5], then the changes of `rest` and `sharper`.
+    """The linear problem around an estimate. The unknowns are [particle, 5], then the changes of `rest` and `sharper`.
 
     Attributes:
-        patches: of the particles; None: outside.
-        left: what the estimate leaves of the projections.
-        blocks: [particle, 5, 5] approximation of the normal matrix of a particle by itself.
+        patches: the particles in the state; None for a particle outside.
+        residual: projections minus the projections of the estimate.
+        blocks: [particle, 5, 5], approximate normal matrix of each particle without the others.
     """
 
     views: StateViews
     bodies: Sequence[Body]
     now: ParticleEstimate
     patches: list[Patch | None]
-    left: F32
+    residual: F32
     blocks: F64
     others: F64
     prior: F64
@@ -173,7 +175,7 @@ class Linear:
         for patch, gain in zip(patches, now.gain, strict=True):
             if patch is not None:
                 volume[patch.box] += np.float32(gain) * (patch.columns[0] + np.float32(now.sharper) * patch.laplacian)
-        left = views.lines - views.projector.forward_lines(volume)
+        residual = views.lines - views.projector.forward_lines(volume)
         mean = float(views.weight[views.weight > 0].mean()) * views.projector.geometry.n_views
         edge = views.projector.grid.voxel_size
         blocks = np.stack([
@@ -182,9 +184,9 @@ class Linear:
             else mean * edge**2 * gram(patch.columns[..., views.known[patch.box[2]]])
             for patch in patches
         ])  # fmt: skip
-        noise = float((views.weight * left**2).sum() / max(views.weight.sum(), 1e-30)) * float(views.weight.mean())
+        noise = float((views.weight * residual**2).sum() / max(views.weight.sum(), 1e-30)) * float(views.weight.mean())
         prior = noise / np.square(_PRIOR)
-        linear = cls(views, bodies, now, patches, left, blocks, np.ones(2), prior)
+        linear = cls(views, bodies, now, patches, residual, blocks, np.ones(2), prior)
         units = []
         for k in range(2):
             rays = views.projector.forward_lines(linear._volume(np.zeros((len(patches), UNKNOWNS)), np.eye(2)[k]))
@@ -220,7 +222,7 @@ class Linear:
 
     @property
     def seen(self) -> F64:
-        """[particle] the share of it in slices that the projections show."""
+        """[particle] share of the particle that lies in slices that the projections show."""
         return np.array([
             0.0 if patch is None else float(np.square(patch.columns[0][..., self.views.known[patch.box[2]]]).sum())
             / (scale**3 * body.squares)
@@ -228,7 +230,7 @@ class Linear:
         ])  # fmt: skip
 
     def solved(self, rays: F32, iterations: int) -> F64:
-        """Unknowns that explain the rays best."""
+        """The unknowns that explain the rays best."""
         inverse = np.linalg.inv(self.blocks + self.prior * np.eye(UNKNOWNS))
 
         def scaled(r: F64) -> F64:
@@ -240,8 +242,9 @@ class Linear:
     def noise_by_halves(self, typical: NDArray[np.bool_]) -> F64:
         """[particle, 6] standard deviations of what `MEASURED` lists.
 
-        Those of a particle by itself, times a factor for each unknown: by how much more the results from both halves
-        of the projections differ, over all `typical` particles.
+        A standard deviation is first computed for the particle without the others. It is then multiplied by a factor
+        for each unknown: how much larger the differences between the results from both halves of the projections are,
+        over all `typical` particles.
         """
         angles = self.views.projector.geometry
         order = np.argsort(np.mod(angles.angles, angles.period), kind="stable")
@@ -249,11 +252,11 @@ class Linear:
         for k in (0, 1):
             some = np.sort(order[k::2])
             half = replace(
-                self, views=self.views.subset(some), left=self.left[some], blocks=self.blocks / 2,
+                self, views=self.views.subset(some), residual=self.residual[some], blocks=self.blocks / 2,
                 others=self.others / 2, prior=self.prior / 2,
             )  # fmt: skip
-            halves.append(half.solved(half.left, _HALVES)[:-2].reshape(-1, UNKNOWNS) @ MEASURED.T)
-        noise = float((self.views.weight * self.left**2).sum() / max(self.views.weight.sum(), 1e-30))
+            halves.append(half.solved(half.residual, _HALVES)[:-2].reshape(-1, UNKNOWNS) @ MEASURED.T)
+        noise = float((self.views.weight * self.residual**2).sum() / max(self.views.weight.sum(), 1e-30))
         inverse = np.linalg.inv(self.blocks + self.prior * np.eye(UNKNOWNS))
         alone = np.sqrt(noise * np.einsum("mi,kij,mj->km", MEASURED, inverse, MEASURED))
         ratio = np.abs(halves[0] - halves[1]) / 2 / alone
@@ -281,13 +284,14 @@ def conjugate(normal: Callable[[F64], F64], right: F64, scaled: Callable[[F64], 
 def gram(columns: F32) -> F64:
     """[5, 5] inner products of the projections of the columns, a mean over angles, in voxels of edge 1.
 
-    The mean over all angles of the products of projections is a product in Fourier space with the weight 1 / (π |k|).
+    The mean over all angles of the products of projections equals an inner product in Fourier space with the weight 1 /
+    (π |k|).
     """
     n = tuple(fft.next_fast_len(2 * size) for size in columns.shape[1:3])
     spectrum = fft.rfft2(columns, n, (1, 2))
     ky, kx = fft.fftfreq(n[0])[:, None], fft.rfftfreq(n[1])
     k = np.hypot(ky, kx)
-    k[0, 0] = 1 / (2 * math.log(1 + math.sqrt(2)) * (n[0] + n[1]))  # the mean of 1/|k| over the cell at 0
+    k[0, 0] = 1 / (2 * math.log(1 + math.sqrt(2)) * (n[0] + n[1]))  # mean of 1/|k| over the frequency cell at 0
     twice = np.where((kx > 0) & ~((n[1] % 2 == 0) & (kx == 0.5)), 2.0, 1.0)
     flat = (spectrum * np.sqrt(twice / (np.pi * k * n[0] * n[1]))[None, :, :, None]).reshape(len(columns), -1)
     return np.real(flat @ flat.conj().T)
@@ -296,10 +300,10 @@ def gram(columns: F32) -> F64:
 def improved_rounds(
     views: StateViews, bodies: Sequence[Body], now: ParticleEstimate, iterations: Sequence[int]
 ) -> ParticleEstimate:
-    """The estimate after rounds of Gauss-Newton, each with this number of iterations."""
+    """The estimate after Gauss-Newton rounds. `iterations` has the number of iterations of each round."""
     for each in iterations:
         linear = Linear.of(views, bodies, now)
-        step = linear.solved(linear.left, each)
+        step = linear.solved(linear.residual, each)
         theta = np.clip(step[:-2].reshape(-1, UNKNOWNS), -np.array(_LARGEST), _LARGEST)
         theta[[patch is None for patch in linear.patches]] = 0
         now = replace(
@@ -320,11 +324,13 @@ def inside_of(views: StateViews, bodies: Sequence[Body], now: ParticleEstimate, 
 
 
 def unexplained(views: StateViews, bodies: Sequence[Body], now: ParticleEstimate, mask: F32) -> F32:
-    """[y, x, z] what particles show beside their shape, in the mask: of cracked ones, the crack.
+    """[y, x, z] the part inside the mask that the shapes of the particles do not explain. For cracked particles it is
+    the crack.
 
-    The fit of the other particles is then not disturbed by it. It is orthogonal to the unknowns of its own particle.
+    It is subtracted so that it does not disturb the fit of the other particles. It is orthogonal to the unknowns of its
+    own particle.
     """
-    left, weight = Linear.of(views, bodies, now).left, views.weight
+    residual, weight = Linear.of(views, bodies, now).residual, views.weight
 
     def back(rays: F32) -> F64:
         return (mask * views.projector.adjoint_lines(rays * weight)).ravel().astype(np.float64)
@@ -332,5 +338,5 @@ def unexplained(views: StateViews, bodies: Sequence[Body], now: ParticleEstimate
     def normal(v: F64) -> F64:
         return back(views.projector.forward_lines(mask * v.reshape(mask.shape).astype(np.float32)))
 
-    found = conjugate(normal, back(left), lambda r: r, _CRACK)
-    return mask * found.reshape(mask.shape).astype(np.float32)
+    crack = conjugate(normal, back(residual), lambda r: r, _CRACK)
+    return mask * crack.reshape(mask.shape).astype(np.float32)

@@ -1,4 +1,6 @@
-"""Numbers of the particles of a reference in a state, each with an interval: from the projections of the state."""
+"""Measures grey level, growth and shift of the particles of a reference in a state, each with an interval, from the
+projections of the state.
+"""
 
 from __future__ import annotations
 
@@ -29,41 +31,46 @@ from recon.reconstruction import reconstruct
 from recon.voxels.direct import Fbp
 from recon.voxels.projector import Projector, projection_lines, volume_lines
 
-WIDE = 1.2816  # standard deviations of an interval that holds the true number in 80 % of cases
-STEPS = 6  # of a state, for the progress
+WIDE = 1.2816  # half width, in standard deviations, of an interval that contains the true value in 80 % of cases
+STEPS = 6  # number of steps for a state, for the progress
 Numbers = NDArray[np.int32]
 Verdict = Literal["as before", "cracked", "closed", "gone", "not seen"]
 
-_HALO = 3  # voxels around a particle's label that belong to it
-_SHELL = 2  # voxels beyond them, in which the level around particles is measured
-_CORE = 2  # least distance from the surface of voxels that give a particle's level
-_LARGEST = 0.25  # share of the volume's voxels from which a label is no particle but a wall, or the whole
-_SMOOTH = 3.0  # voxels of the Gaussian after which `rest` has no noise
-_BLUR = 4.0  # pixels of the Gaussian after which line integrals give weights that do not depend on their own noise
-_SPLINES = (4, 2.0), (6, 1.0)  # intervals, and blur in voxels, of the steps after the affine map
+_HALO = 3  # voxels around the label of a particle that count as part of the particle
+_SHELL = 2  # thickness in voxels of the shell around them, in which the level around the particle is measured
+_CORE = 2  # least distance from the surface, in voxels, of the voxels from which the level of a particle is computed
+_LARGEST = 0.25  # share of the volume's voxels: a larger label is not a particle, but a wall or the whole sample
+_SMOOTH = 3.0  # width in voxels of the Gaussian that removes the noise of `rest`
+# width in pixels of the Gaussian that smooths line integrals for weights, so that the weights do not depend on the
+# noise of the same pixels
+_BLUR = 4.0
+_SPLINES = (4, 2.0), (6, 1.0)  # number of intervals, and blur in voxels, of the steps after the affine map
 _MOTION_VIEWS = 40
-_SAME = 0.3, 0.1  # most particles of the same sample have a gain and a diameter this near to the median (relative)
-_MOST, _LEAST_GAIN = 0.65, 0.5  # share of such particles, and median of the gain, of the same sample
-_GONE = 0.3  # gain below which a particle is gone
-_SEEN = 0.5  # share of a particle that must be in rows that are used
-_CLEAR = 3.0  # standard deviations by which a cracked particle has less than the others
-_TYPICAL = 8  # whole particles, from which the spread is taken of these alone
-_LEAST_CRACK = 0.01  # least share of a particle that is missing in a crack
+# relative differences of gain and of diameter from the median, within which most particles of the same sample lie
+_SAME = 0.3, 0.1
+# if the sample is the same: smallest share of these particles, and smallest median of the gain
+_MOST, _LEAST_GAIN = 0.65, 0.5
+_GONE = 0.3  # a particle with a smaller gain is gone
+_SEEN = 0.5  # smallest share of a particle that must lie in rows that are used
+_CLEAR = 3.0  # standard deviations by which a cracked particle has less mass than the others
+_TYPICAL = 8  # if there are at least so many whole particles, the spread is computed from these only
+_LEAST_CRACK = 0.01  # smallest share of a particle that must be missing in a crack
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceParticles:
-    """A reference volume in parts, in voxels: attenuation per voxel, [y, x, z].
+    """A reference volume divided into parts. Volumes are [y, x, z]; lengths are in voxels, so attenuation is per voxel.
 
     Attributes:
-        volume: of the reference.
-        rest: what is no particle.
-        owner: the body, from 1, of each voxel of particles and near them; 0: none.
-        bodies: of the particles.
-        around: level around the particles.
-        grid: of the reference, in mm.
-        labels: [body] numbers in the labelled volume.
-        voxels: [body] number of voxels.
+        volume: the whole reference.
+        rest: everything that is not a particle.
+        owner: number, from 1, of the body to which a voxel belongs; voxels near a particle belong to it, too. 0: no
+            body.
+        bodies: the particles.
+        around: level around each particle.
+        grid: grid of the reference, in mm.
+        labels: [body], number of the body in the labelled volume.
+        voxels: [body], number of voxels of the body.
     """
 
     volume: F32
@@ -76,19 +83,19 @@ class ReferenceParticles:
 
     @property
     def cut(self) -> NDArray[np.bool_]:
-        """[body] whether it touches the lowest or the highest slice."""
+        """bool [body], True if the body touches the lowest or the highest slice."""
         ends = np.unique(self.owner[:, :, [0, -1]])
         return np.isin(np.arange(1, len(self.bodies) + 1), ends)
 
 
 def reference_particles(volume: F32, labels: Numbers, grid: Grid) -> ReferenceParticles:
-    """The parts of a reference.
+    """Divide a reference into parts.
 
     Args:
         volume, labels: [z, y, x], in 1/mm, and the particle of each voxel.
 
     Raises:
-        ValueError: no label is a particle.
+        ValueError: none of the labels is a particle.
     """
     counts = np.bincount(labels.ravel())
     kept = np.flatnonzero((counts > 0) & (counts < _LARGEST * labels.size))
@@ -120,13 +127,14 @@ def reference_particles(volume: F32, labels: Numbers, grid: Grid) -> ReferencePa
 
 @dataclass(frozen=True, eq=False)
 class ParticleFit:
-    """What the projections of a state say of the bodies.
+    """The result of the fit of the bodies to the projections of a state.
 
     Attributes:
-        estimate: in voxels.
-        noise: [body, 6] standard deviations of gain, scale, shift (y, x, z) and mass, from halves of the projections.
-        seen: [body] share of each that the used rows show.
-        motion: [body, (y, x, z)] shift from the reference, in voxels.
+        estimate: the estimate, with lengths in voxels.
+        noise: [body, 6], standard deviations of gain, scale, shift (y, x, z) and mass, from the two halves of the
+            projections.
+        seen: [body], share of the body that the used rows show.
+        motion: [body, (y, x, z)], shift from the reference in voxels.
     """
 
     estimate: ParticleEstimate
@@ -136,13 +144,13 @@ class ParticleFit:
 
     @property
     def measured(self) -> F64:
-        """[body, 6] changes of gain, scale, shift (y, x, z) and mass."""
+        """[body, 6], changes of gain, scale, shift (y, x, z) and mass."""
         e = self.estimate
         return np.column_stack((e.gain - 1, e.scale - 1, self.motion, e.gain * e.scale**3 - 1))
 
     @property
     def matches(self) -> bool:
-        """Whether most particles of the reference are in this state."""
+        """True if this state contains most particles of the reference, so that it is the same sample."""
         seen = self.seen >= _SEEN
         gain, scale = self.estimate.gain[seen], self.estimate.scale[seen]
         if not gain.size or np.median(gain) < _LEAST_GAIN:
@@ -153,14 +161,14 @@ class ParticleFit:
 
 @dataclass(frozen=True, eq=False)
 class StateNumbers:
-    """Numbers of the bodies of a reference in a state; NaN if not determined.
+    """Values of the bodies of a reference in a state, with intervals; NaN for a value that is not determined.
 
     Attributes:
-        grey: [body, 3] value, low and high: attenuation in 1/mm.
-        grey_change: [body, 3] relative change of it since the reference.
+        grey: [body, 3] attenuation in 1/mm: value, low end and high end.
+        grey_change: [body, 3] relative change of the attenuation since the reference.
         growth: [body, 3] relative change of the volume.
-        shift: [body, axis z y x, 3] in mm.
-        verdict: of each body.
+        shift: [body, axis z y x, 3] shift in mm.
+        verdict: verdict on each body.
     """
 
     grey: F64
@@ -171,45 +179,48 @@ class StateNumbers:
 
 
 def numbers_of(reference: ReferenceParticles, fit: ParticleFit) -> StateNumbers:
-    """The numbers of a state.
+    """The values of the bodies in a state.
 
-    A particle is cracked if its mass is less than the median by three standard deviations of its own error and of the
-    spread of all particles, and by 1 %: a crack that is narrower than a voxel takes mass away. So is one that seems to
-    grow by three of them more than the median while its mass falls by one: a dark core looks like a lower grey level
-    in a larger volume.
+    A standard deviation here combines the error of the particle with the spread of all particles. A particle is cracked
+    in two cases. (1) Its change of mass is below the median by more than three standard deviations and by more than 1
+    %: a crack that is narrower than a voxel removes mass. (2) Its growth is above the median by more than three
+    standard deviations, and its change of mass is below the median by more than one: a dark core looks like a lower
+    grey level in a larger volume.
     """
-    found, deviation = fit.measured, fit.noise
+    changes, deviation = fit.measured, fit.noise
     seen = (fit.seen >= _SEEN) & fit.matches
-    gone = seen & (found[:, 0] + 1 < _GONE)
+    gone = seen & (changes[:, 0] + 1 < _GONE)
     some = seen & ~gone
     verdict = np.where(seen, np.where(gone, "gone", "as before"), "not seen").astype("<U9")
     if some.any():
         typical = some & ~reference.cut if (some & ~reference.cut).sum() >= _TYPICAL else some
-        (lost, of_mass), (wider, of_scale) = (_away(found[:, j], deviation[:, j], typical) for j in (5, 1))
+        (lost, of_mass), (wider, of_scale) = (_away(changes[:, j], deviation[:, j], typical) for j in (5, 1))
         least = np.maximum(_CLEAR * of_mass, _LEAST_CRACK)
         for name, sign in (("cracked", 1), ("closed", -1)):
             outlier = (sign * wider > _CLEAR * of_scale) & (sign * lost < -of_mass)
             verdict[some & ((sign * lost < -least) | outlier)] = name
-    found, edge = np.where(seen[:, None], found, np.nan), reference.grid.voxel_size
-    found[gone, 1:] = np.nan
+    changes, edge = np.where(seen[:, None], changes, np.nan), reference.grid.voxel_size
+    changes[gone, 1:] = np.nan
     level = np.array([body.level for body in reference.bodies])
     before = (level + reference.around) / edge
     around = reference.around * (1 + fit.estimate.rest)
-    grey = _interval((around + level * (1 + found[:, 0])) / edge, level * deviation[:, 0] / edge)
-    scale = _interval(1 + found[:, 1], deviation[:, 1])
-    shift = edge * _interval(found[:, [4, 2, 3]], deviation[:, [4, 2, 3]])
+    grey = _interval((around + level * (1 + changes[:, 0])) / edge, level * deviation[:, 0] / edge)
+    scale = _interval(1 + changes[:, 1], deviation[:, 1])
+    shift = edge * _interval(changes[:, [4, 2, 3]], deviation[:, [4, 2, 3]])
     return StateNumbers(grey, grey / before[:, None] - 1, scale**3 - 1, shift, tuple(verdict.tolist()))
 
 
 def _away(value: F64, deviation: F64, some: NDArray[np.bool_]) -> tuple[F64, F64]:
-    """How far values are from the median of `some`, and the standard deviation of that: of its error and the spread."""
+    """The differences of values from the median of `some`, and the standard deviations of these differences, which
+    combine the error of a value with the spread of all values.
+    """
     away = value - np.median(value[some])
     spread_ = np.square(1.4826 * np.median(np.abs(away[some]))) - np.median(np.square(deviation[some]))
     return away, np.sqrt(np.square(deviation) + max(float(spread_), 0.0))
 
 
 def _interval(value: F64, deviation: F64) -> F64:
-    """[..., 3] value, low and high."""
+    """[..., 3] value, low end and high end."""
     return np.stack((value, value - WIDE * deviation, value + WIDE * deviation), axis=-1)
 
 
@@ -220,10 +231,10 @@ def fit_state(
     """Fit the bodies of a reference to the projections of a state.
 
     Args:
-        lines: [view, row, col] line integrals, finite.
-        geometry: of a parallel beam, with pixels as wide as the voxels of the reference.
-        weights: of each ray; None: 1 everywhere.
-        tell: is called after each of `STEPS` steps.
+        lines: [view, row, col], line integrals, finite.
+        geometry: geometry of a parallel beam. Pixels must be as wide as the voxels of the reference.
+        weights: weight of each ray; None: 1 for all.
+        tell: function that is called after each of the `STEPS` steps.
     """
     edge = reference.grid.voxel_size
     geometry = geometry.scaled(1 / edge)
@@ -236,9 +247,9 @@ def fit_state(
     u, turn = _moved(reference, projector, p, weight, offset)
     tell()
     places = _places_of(reference, u, offset)
-    at = _sampled(u, offset)
-    rest = ndimage.map_coordinates(reference.rest, at, order=1, mode="nearest")
-    known = ((at[2] > -0.5) & (at[2] < reference.rest.shape[2] - 0.5)).all((0, 1))
+    sampled = _sampled(u, offset)
+    rest = ndimage.map_coordinates(reference.rest, sampled, order=1, mode="nearest")
+    known = ((sampled[2] > -0.5) & (sampled[2] < reference.rest.shape[2] - 0.5)).all((0, 1))
     weight[:, :, ~_rows_of(known, geometry, grid)] = 0
     views = StateViews(projector, p, weight, rest, ndimage.gaussian_filter(rest, _SMOOTH), known)
     n = len(reference.bodies)
@@ -260,7 +271,7 @@ def fit_state(
 
 
 def _less(estimate: ParticleEstimate) -> NDArray[np.bool_]:
-    """The bodies of which less is there than of most."""
+    """bool [body], True if the body has clearly less mass than most bodies."""
     mass = estimate.gain * estimate.scale**3
     middle = float(np.median(mass))
     spread_ = 1.4826 * float(np.median(np.abs(mass - middle)))
@@ -268,7 +279,7 @@ def _less(estimate: ParticleEstimate) -> NDArray[np.bool_]:
 
 
 def _rows_of(known: NDArray[np.bool_], geometry: Geometry, grid: Grid) -> NDArray[np.bool_]:
-    """[row] whether the slices that a row sees are known."""
+    """bool [row], True if the slices that the row sees are known."""
     heights = (np.arange(geometry.detector_shape[0]) - geometry.axis_row) * geometry.sample_pitch
     slices = (heights - grid.first[0]) / grid.spacing[0]
     last = known.size - 1
@@ -276,7 +287,9 @@ def _rows_of(known: NDArray[np.bool_], geometry: Geometry, grid: Grid) -> NDArra
 
 
 def _moved(reference: ReferenceParticles, projector: Projector, p: F32, weight: F32, offset: F64) -> tuple[F32, F64]:
-    """How the whole has moved, roughly: displacement u [3, y, x, z] in voxels, and the rotation in it."""
+    """The approximate motion of the whole sample: displacement u [3, y, x, z] in voxels, and the rotation that it
+    contains.
+    """
     grid, geometry = projector.grid, projector.geometry
     nz, ny, nx = grid.shape
     still = np.zeros((3, ny, nx, nz), np.float32)
@@ -297,10 +310,10 @@ def _moved(reference: ReferenceParticles, projector: Projector, p: F32, weight: 
     views, nothing = MotionViews(projector.subset(some), p[some], weight[some]), np.zeros_like(fbp)
     moved = affinely_moved(views, moved, affine, nothing)
     c = affine.nearest(moved.u)
-    # Places in the reference change by the identity plus these slopes from voxel to voxel of the state.
+    # Places in the reference change by the identity plus these slopes from one voxel of the state to the next.
     slopes = np.eye(3)
-    for axis, at in enumerate(((1, 0, 0), (0, 1, 0), (0, 0, 1))):
-        slopes[: affine.axes, axis] += c[:, *at] * 2 / width
+    for axis, direction in enumerate(((1, 0, 0), (0, 1, 0), (0, 0, 1))):
+        slopes[: affine.axes, axis] += c[:, *direction] * 2 / width
     left, _, right = np.linalg.svd(slopes)
     for intervals, blur in _SPLINES:
         moved = improved(views, moved, Basis.splines(grid, width, intervals), blur, nothing, False)
@@ -308,7 +321,7 @@ def _moved(reference: ReferenceParticles, projector: Projector, p: F32, weight: 
 
 
 def _sampled(u: F32, offset: F64) -> F32:
-    """[3, y, x, z] the place in the reference of each voxel of the state."""
+    """[3, y, x, z] place in the reference of each voxel of the state."""
     return np.stack([
         u[axis] + np.float32(offset[axis])
         + np.arange(u.shape[axis + 1], dtype=np.float32).reshape([-1 if a == axis else 1 for a in range(3)])
@@ -317,7 +330,7 @@ def _sampled(u: F32, offset: F64) -> F32:
 
 
 def _places_of(reference: ReferenceParticles, u: F32, offset: F64) -> F64:
-    """[body, (y, x, z)] the place in the state of each body of the reference."""
+    """[body, (y, x, z)] position in the state of each body of the reference."""
     goal = np.array([body.centre for body in reference.bodies]) - offset
     place = goal.copy()
     for _ in range(8):

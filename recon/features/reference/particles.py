@@ -1,4 +1,6 @@
-"""The parts of a reference volume: the ground between particles, what is above it, and the particle of each voxel."""
+"""Divides a reference volume into parts: the ground between particles, the excess above the ground, and the particle of
+each voxel.
+"""
 
 from __future__ import annotations
 
@@ -11,21 +13,22 @@ from scipy import ndimage as ndi
 from recon.base.arrays import F32
 from recon.base.volume import Grid, Volume
 
-_HULL = 8  # voxels by which gaps are closed, so that the material between particles is found
-_NEAR = 4  # voxels around a particle that belong to it
-_LEAST_GROUND = 100  # voxels from which on the ground is measured; otherwise there is air between particles
+_HULL = 8  # voxels by which gaps are closed, to find the material between particles
+_NEAR = 4  # voxels around a particle that count as part of the particle
+# smallest number of voxels from which the ground is measured; with fewer voxels, air is assumed between particles
+_LEAST_GROUND = 100
 
 
 @dataclass(frozen=True, eq=False)
 class Particles:
-    """A reference volume [y, x, z] in parts.
+    """A reference volume [y, x, z] divided into parts.
 
     Attributes:
-        ground: the volume up to the level between particles.
-        above: what the volume has above that level; ground + above is the volume.
-        label: the particle of each voxel, from 1; 0: none within 4 voxels.
-        base: the level between particles.
-        level: typical level of particles above `base`.
+        ground: the part of each value up to the level between particles.
+        above: the rest of each value; ground + above is the volume.
+        label: number, from 1, of the particle to which a voxel belongs; 0: there is no particle within 4 voxels.
+        base: level between particles.
+        level: typical excess of particles above `base`.
     """
 
     ground: F32
@@ -45,20 +48,20 @@ class Particles:
 
 
 def particles_of(volume: F32) -> Particles | None:
-    """The parts of a volume [y, x, z]; None: it shows no material.
+    """Divide a volume [y, x, z] into parts. None: the volume shows no material.
 
     Two levels are separated by Otsu's threshold (1979, IEEE Trans. Syst. Man Cybern. 9, 62). The ground is the median
-    of the voxels below it that are enclosed by solid ones. A particle is the set of solid voxels that climb to the same
-    summit of the smoothed distance from the surface.
+    of the voxels below the threshold that are enclosed by solid voxels. A particle is the set of solid voxels from
+    which steepest ascent of the smoothed distance from the surface leads to the same summit.
     """
     v = np.maximum(volume, 0)
     seen = v[v > 0.1 * np.percentile(v, 99)] if v.any() else v[:0]
     if seen.size < 2 or seen.min() == seen.max():
         return None
     counts, edges = np.histogram(seen, 200)
-    at, w = (edges[1:] + edges[:-1]) / 2, np.cumsum(counts)
-    mean = np.cumsum(counts * at)
-    split = at[np.argmax((mean[-1] * w / w[-1] - mean) ** 2 / np.maximum(w * (w[-1] - w), 1))]
+    levels, w = (edges[1:] + edges[:-1]) / 2, np.cumsum(counts)
+    mean = np.cumsum(counts * levels)
+    split = levels[np.argmax((mean[-1] * w / w[-1] - mean) ** 2 / np.maximum(w * (w[-1] - w), 1))]
     solid, cross, wide = v > split, ndi.generate_binary_structure(2, 1)[..., None], _HULL + 4
     rim = ((wide, wide), (wide, wide), (0, 0))
     hull = ndi.binary_closing(np.pad(solid, rim), cross, iterations=_HULL)[wide:-wide, wide:-wide]
@@ -73,12 +76,14 @@ def particles_of(volume: F32) -> Particles | None:
 
 
 def summits(depth: F32, solid: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Numbers from 1 [y, x, z]: each solid voxel belongs to the summit of `depth` that it climbs to; 0 elsewhere."""
-    apart = depth + 1e-6 * np.arange(depth.size).reshape(depth.shape) / depth.size  # no ties
+    """[y, x, z] numbers from 1: each solid voxel gets the number of the summit of `depth` to which steepest ascent
+    leads. 0 elsewhere.
+    """
+    apart = depth + 1e-6 * np.arange(depth.size).reshape(depth.shape) / depth.size  # no two voxels have the same depth
     uphill, best = np.arange(depth.size).reshape(depth.shape), apart.copy()
     box, index = np.pad(apart, 1), np.pad(uphill, 1)
-    for at in np.ndindex(3, 3, 3):
-        part = tuple(slice(o, o + n) for o, n in zip(at, depth.shape, strict=True))
+    for corner in np.ndindex(3, 3, 3):
+        part = tuple(slice(o, o + n) for o, n in zip(corner, depth.shape, strict=True))
         better = box[part] > best
         best[better], uphill[better] = box[part][better], index[part][better]
     flat = uphill.ravel()
@@ -90,7 +95,9 @@ def summits(depth: F32, solid: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 
 def require_finite(reference: Volume) -> None:
-    """Raises ValueError if a voxel of the reference has no finite value: it would spoil the levels of all particles."""
+    """Raise ValueError if a voxel of the reference is not finite, because it would spoil the levels of all
+    particles.
+    """
     voxels = reference.data
     wrong = sum(int(np.count_nonzero(~np.isfinite(each))) for each in voxels)
     if wrong:
@@ -101,13 +108,13 @@ def require_finite(reference: Volume) -> None:
 
 
 def placed(reference: Volume, grid: Grid, margin: int) -> tuple[F32, tuple[int, int, int]]:
-    """The reference on the voxels of `grid` and up to `margin` voxels beyond it, as far as it reaches.
+    """The reference on the voxels of `grid`, and up to `margin` voxels beyond, as far as the reference extends.
 
     Returns:
-        The voxels [y, x, z], and which of them (y, x, z) lies at voxel 0 of the grid.
+        The voxels [y, x, z], and the index (y, x, z) in them of voxel 0 of the grid.
 
     Raises:
-        ValueError: the reference and the grid have no common place.
+        ValueError: the reference and the grid have no place in common.
     """
     given = reference.grid
     size, edge, start = np.array(grid.shape), np.array(grid.spacing), np.array(grid.first)
@@ -129,7 +136,7 @@ def placed(reference: Volume, grid: Grid, margin: int) -> tuple[F32, tuple[int, 
         first = np.rint(offset).astype(int)
         part = data[tuple(slice(f, f + n) for f, n in zip(first, high - low + 1, strict=True))]
     else:
-        if ratio.max() > 1.5:  # coarser voxels show the mean; an even window begins half a voxel early
+        if ratio.max() > 1.5:  # coarser voxels are means; a window of even size begins half a voxel early
             wide = np.maximum(np.rint(ratio), 1).astype(int)
             data, offset = ndi.uniform_filter(data, wide, mode="nearest"), offset + (wide % 2 == 0) / 2
         part = ndi.affine_transform(data, ratio, offset, tuple(high - low + 1), order=1, mode="nearest")

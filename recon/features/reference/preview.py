@@ -1,4 +1,6 @@
-"""A picture of a state while it is scanned: the moved reference, and FBP of what it leaves of the projections."""
+"""Makes a picture of a state while it is scanned: the moved reference, and FBP of the residual that it leaves in the
+projections.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +23,11 @@ from recon.voxels.voxel_problem import VoxelProblem, times_power
 
 
 def preview_of(reference: Volume, views: Views) -> Preview | None:
-    """The moved reference plus FBP of the residual, on the voxels of a few detector rows; None: fewer than 16
-    projections, another geometry than parallel rows, or a reference that shows no material there.
+    """The moved reference plus FBP of the residual, on the voxels of a few detector rows. None in three cases: there
+    are fewer than 16 projections, the geometry is not a parallel beam with straight rows, or the reference shows no
+    material there.
 
-    The motion is found as by `FromReference`, but with FBP of the residual in place of iterations. (With the motion
+    The motion is found as in `FromReference`, but with FBP of the residual instead of iterations. (With the motion
     known, this is one FBP: Chen, Tang & Leng 2008, Med. Phys. 35, 660, without the iterations.)
     """
     geometry = views.geometry
@@ -36,7 +39,9 @@ def preview_of(reference: Volume, views: Views) -> Preview | None:
 
 
 class _Leaves:
-    """From a reference to the volume; after it, the moved reference [z, y, x] in 1/mm, and the share it leaves."""
+    """Makes the volume from a reference. Afterwards it also has the moved reference [z, y, x] in 1/mm, and the share of
+    the projections that the reference leaves.
+    """
 
     def __init__(self, reference: Volume) -> None:
         self._reference = reference
@@ -62,11 +67,13 @@ class _Leaves:
 
 
 def _rest(problem: VoxelProblem, x: F32) -> tuple[F32, float]:
-    """FBP [y, x, z] of what a volume leaves of the projections, and the norm of the latter, divided by theirs."""
-    left = problem.views - problem.projector.forward_lines(x)
+    """FBP [y, x, z] of the residual of a volume in the projections, and the norm of the residual divided by the norm of
+    the projections.
+    """
+    residual = problem.views - problem.projector.forward_lines(x)
     of_rays = 1.0 if problem.weight is None else problem.weight > 0
     share = math.sqrt(
-        float(np.square(left * of_rays).sum()) / max(float(np.square(problem.views * of_rays).sum()), 1e-30)
+        float(np.square(residual * of_rays).sum()) / max(float(np.square(problem.views * of_rays).sum()), 1e-30)
     )
-    filtered = replace(problem, data=left, measured=None).filtered("hann")
+    filtered = replace(problem, data=residual, measured=None).filtered("hann")
     return np.zeros_like(x) if filtered is None else filtered, share

@@ -1,4 +1,6 @@
-"""Weights of total variation that fall where a state differs from its reference, and along thin dark lines."""
+"""Computes weights of total variation that are lower where a state differs from its reference, and along thin dark
+lines.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +14,17 @@ from recon.features.reference.motion import Moved
 from recon.kernels.cpu.stencils import weighted_sum
 from recon.voxels.voxel_problem import VoxelProblem
 
-_FLOOR = 0.1  # slope of the change, in levels of particles per voxel, that halves its weight
-_FROM, _STEP = 3.0, 0.7  # deviations of the noise from which on a dark line counts, and that lower weights once more
-_MOST = 4.0  # largest fall by a line
-_LENGTH, _BESIDE, _TURNS = 9, 2.5, 12  # of a line in voxels; from it to what is beside it; directions
+_FLOOR = 0.1  # slope of the change, in particle levels per voxel, at which the weight is half
+# standard deviations of the noise from which on a dark line counts; further standard deviations that lower the weight
+# by one more unit
+_FROM, _STEP = 3.0, 0.7
+_MOST = 4.0  # largest reduction by a line
+# length of a line in voxels; distance in voxels from the line to its sides; number of directions
+_LENGTH, _BESIDE, _TURNS = 9, 2.5, 12
 
 
 def falling(problem: VoxelProblem, moved: Moved, x: F32, m: F32) -> tuple[F32, F32]:
-    """Factors [y, x, z] of the weights of x and of the change x - m."""
+    """Factors [y, x, z] on the weight of x, and on the weight of the change x - m."""
     square = np.zeros_like(x)
     for axis in range(3):
         low = tuple(slice(None, -1) if e == axis else slice(None) for e in range(3))
@@ -33,14 +38,15 @@ def falling(problem: VoxelProblem, moved: Moved, x: F32, m: F32) -> tuple[F32, F
 
 
 def dark_lines(problem: VoxelProblem, moved: Moved, x: F32, m: F32) -> F32:
-    """In particles: by how many deviations of the noise a line of voxels is darker than both of its sides.
+    """How much a line of voxels inside a particle is darker than both of its sides, in standard deviations of the
+    noise.
 
-    The lines are those of the change x - m and of what filtered back-projection makes of the residual; 0 beside
+    Lines are searched for in the change x - m plus the filtered back-projection of the residual. The value is 0 outside
     particles.
     """
     own = moved.particles
-    left = problem.views - problem.projector.forward_lines(x)
-    d, missing = x - m, replace(problem, data=left, measured=None).filtered("hann")
+    residual = problem.views - problem.projector.forward_lines(x)
+    d, missing = x - m, replace(problem, data=residual, measured=None).filtered("hann")
     if missing is not None:
         d = d + missing
     d = ndi.uniform_filter1d(d, min(3, d.shape[2]), axis=2, mode="nearest")
@@ -56,7 +62,9 @@ def dark_lines(problem: VoxelProblem, moved: Moved, x: F32, m: F32) -> F32:
 
 
 def line_contrast(turn: float) -> F32:
-    """The stencil of what is beside a line minus the line, in a direction (radians from x towards y)."""
+    """The stencil for the mean of both sides of a line minus the mean of the line, in a direction (radians from x
+    towards y).
+    """
     half = int(_LENGTH / 2 + _BESIDE) + 1
     j, i = np.mgrid[-half : half + 1, -half : half + 1]
     along, across = i * np.cos(turn) + j * np.sin(turn), np.abs(j * np.cos(turn) - i * np.sin(turn))

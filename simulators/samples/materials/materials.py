@@ -45,11 +45,11 @@ class KEdge:
     """Shape of an element's K edge in a layered oxide.
 
     Attributes:
-        white_line: keV, of the fully charged oxide.
-        shift: eV by which the edge lies lower in the discharged oxide.
-        below: eV from the arctangent's middle up to the white line.
-        height: of the white line, in jumps.
-        width: of the white line, eV, full at half its height.
+        white_line: energy in keV of the white line of the fully charged oxide.
+        shift: energy in eV by which the edge is lower in the discharged oxide.
+        below: energy in eV by which the middle of the arctangent is below the white line.
+        height: height of the white line, in units of the jump.
+        width: full width at half maximum of the white line in eV.
     """
 
     white_line: float
@@ -103,7 +103,7 @@ def profile(from_line: Reals, level_width: float, shape: KEdge) -> Reals:
 
 
 def _power_law(table: MassAttenuation, edge: float, near: float, far: float) -> MassAttenuation:
-    """A E^b through the table at two distances (eV) from the edge."""
+    """The power law A E^b through the table at two distances (eV) from the edge."""
     x = np.array([edge + near * 1e-3, edge + far * 1e-3])
     y = table(x)
     slope = np.log(y[1] / y[0]) / np.log(x[1] / x[0])
@@ -116,15 +116,15 @@ AVOGADRO = 0.602214076  # 1e24 / mol
 
 @dataclass(frozen=True)
 class Material:
-    """Composition and density of a kind of matter.
+    """Composition and density of a material.
 
     Attributes:
-        name: in scenes and labels.
-        density: g/cm³.
-        fractions: (atomic number, share of the mass), of each element once.
-        state_of_charge: of a cathode material, 0 (fully lithiated) to 1: it then has the near-edge structure of
-            `edge`; None: the tables. Composition and density stay those of the discharged state:
-            lithium contributes about a thousandth of an oxide's attenuation.
+        name: name in scenes and labels.
+        density: density in g/cm³.
+        fractions: (atomic number, share of the mass) of each element.
+        state_of_charge: for a cathode material, 0 (fully lithiated) to 1. The attenuation then has the near-edge
+            structure of `edge`; None: the attenuation is that of the tables. Composition and density stay those of the
+            discharged state: lithium contributes about a thousandth of an oxide's attenuation.
         edge_shift_ev: eV from the edge of state 0 to that of state 1, the same for Mn, Co and Ni, -20 ... 20; None:
             the value in `edge`.
     """
@@ -184,7 +184,7 @@ def of_formula(name: str, formula: str, density: float) -> Material:
     """A material by chemical formula ("LiNi0.6Mn0.2Co0.2O2") and density in g/cm³.
 
     Raises:
-        ValueError: not a formula, or not a density.
+        ValueError: the formula or the density is not valid.
     """
     return Material(name, density, _fractions(formula))
 
@@ -246,7 +246,8 @@ _KNOWN: Mapping[str, Callable[[], Material]] = MappingProxyType(
         "Cu": lambda: of_formula("Cu", "Cu", 8.96),
         "Si": lambda: of_formula("Si", "Si", 2.33),
         "Ni": lambda: of_formula("Ni", "Ni", 8.902),
-        "steel": lambda: by_mass("steel", 7.85, {"Fe": 0.995, "Mn": 0.004, "C": 0.001}),  # steel of cans: low carbon
+        # steel of cans: low-carbon steel
+        "steel": lambda: by_mass("steel", 7.85, {"Fe": 0.995, "Mn": 0.004, "C": 0.001}),
         "stainless_steel": lambda: by_mass("stainless_steel", 8.0, {"Fe": 0.71, "Cr": 0.19, "Ni": 0.1}),  # AISI 304
         "electrolyte": _electrolyte,
         "polypropylene": lambda: of_formula("polypropylene", "C3H6", 0.90),  # NIST, table 2, as are the next three
@@ -262,7 +263,7 @@ _KNOWN: Mapping[str, Callable[[], Material]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class _Properties:
-    """Properties of a material that a scene gives; see Material."""
+    """Properties of a material that a scene states; see Material."""
 
     formula: str | None = None
     density: float | None = None
@@ -275,7 +276,7 @@ class Palette:
     """The materials that a scene can name: the known ones and its own.
 
     Attributes:
-        own: by name; they take precedence.
+        own: materials of the scene by name; they take precedence over the known materials.
     """
 
     own: Mapping[str, Material] = field(default_factory=lambda: MappingProxyType({}))

@@ -55,12 +55,12 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Constituent:
-    """One kind of matter in a sample.
+    """One material in a sample.
 
     Attributes:
-        chords: its thickness along a ray, mm; the optical depth if it is grey.
-        material: None: grey.
-        instead_of: the material that it displaces.
+        chords: thickness of the material along a ray in mm; for a grey material, its optical depth.
+        material: the material; None: it is grey.
+        instead_of: the material that this material displaces.
     """
 
     chords: Sample
@@ -78,15 +78,15 @@ class Constituent:
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """Constituents under a spectrum: each one's chords are computed once for any number of energies.
+    """Constituents in a beam with a spectrum. The chords of each constituent are computed once for all energies.
 
-    Its truth is the attenuation in the thin limit, the mean over the photons detected in the open beam. That is the
-    initial slope of the effective depth. Thicker matter appears to attenuate less: beam hardening.
+    The ground truth is the attenuation of a thin layer: the mean over the photons detected in the open beam, which is
+    the initial slope of the effective depth. Thicker material appears to attenuate less (beam hardening).
 
     Attributes:
-        constituents: of the sample.
-        spectrum: energies and weights.
-        whole: the sample with its attenuation in the thin limit.
+        constituents: constituents of the sample.
+        spectrum: energies and weights of the beam.
+        whole: the sample with the attenuation of a thin layer.
     """
 
     constituents: tuple[Constituent, ...]
@@ -128,7 +128,8 @@ def sample_of(parts: Sequence[Part], beam: Beam, filters: Callable[[str], Attenu
         filters: the attenuation of a material by its name, for a tube; None: known materials only.
 
     Raises:
-        ValueError: a material in a beam that does not state its energies, or states some that are not tabulated.
+        ValueError: the sample has materials, but the beam does not state its energies, or states energies outside the
+            tables.
     """
     names = [part.label for part in parts]
     kinds = dict.fromkeys((part.material, part.instead_of) for part in parts)
@@ -149,11 +150,11 @@ def sample_of(parts: Sequence[Part], beam: Beam, filters: Callable[[str], Attenu
     return whole if spectrum.energies.size == 1 else Mixture(groups, spectrum, whole)
 
 
-ROUNDING = 1e-14  # A smaller depth counts as air
+ROUNDING = 1e-14  # a smaller depth counts as air
 
 
 def effective_depth(thickness: Reals, attenuation: Reals, weights: Reals) -> Reals:
-    """The optical depth that a detector measures which integrates over all energies, float64 [row, col].
+    """The optical depth, float64 [row, col], that a detector measures if it integrates over all energies.
 
     It is -log(sum_e w_e exp(-sum_m attenuation[e, m] thickness[m])).
 

@@ -14,13 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 from simulators.light import Beam, Tube
 
 Reals = NDArray[np.float64]
-Attenuation = Callable[[ArrayLike], Reals]  # Linear attenuation in 1/mm at energies in keV
+Attenuation = Callable[[ArrayLike], Reals]  # linear attenuation in 1/mm at energies in keV
 
 NODES = (3, 5, 9, 17, 33, 65, 129, 257, 513)
 TOLERANCE = 1e-5  # share of the open beam in the intensity, much smaller than the noise of a pixel with 7000 electrons
 _FWHM = math.sqrt(8 * math.log(2))
 _LEAST_KEV = 1.0
-_NOTHING = 1e-7  # share of the intensity: smaller weights, of energies that a filter absorbs, are dropped
+_NOTHING = 1e-7  # share of the intensity; smaller weights, at energies that a filter absorbs, are dropped
 _FEW = 9
 _A_FEW = 4
 _REACH = 4.5  # standard deviations; 7e-6 of a line lie beyond
@@ -60,8 +60,9 @@ def light(
     """The spectrum of a beam, with as many energies as these materials need.
 
     Nodes of a line or a tube are doubled until the transmission of up to `thickness` mm of each material changes by
-    less than 1e-5. There are up to 513 nodes: with a bare step within a line half a node's weight is uncertain, 0.4 %
-    of the light. A few of these, or of a table's energies, are kept: they have the same transmission to about 1e-5.
+    less than 1e-5. There are up to 513 nodes: if a line contains a step, half of a node's weight is uncertain, which is
+    0.4 % of the intensity. A few of these, or of a table's energies, are kept: they have the same transmission to about
+    1e-5.
 
     Args:
         filters: the attenuation of a material by its name, for a tube.
@@ -145,7 +146,7 @@ def _tube(tube: Tube, n: int, filters: Callable[[str], Attenuation]) -> Spectrum
     return Spectrum.of(energies, np.where(weights > _NOTHING * weights.sum(), weights, 0.0))
 
 
-STEPS = 40  # Number of thicknesses, from the full thickness down to one 8000th
+STEPS = 40  # number of thicknesses, from the full thickness down to one 8000th
 SHARES = (0.125, 0.5, 0.875)
 """Shares of the first material of each pair. Half of each alone is not enough: for one sample in 1000, with an edge in
 each of two materials, the error is ten times the tolerance."""
@@ -162,11 +163,11 @@ def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float
     Args:
         attenuation: 1/mm, float64 [energy, material].
         weights: float64 [energy], of sum 1.
-        thickness: mm, the longest path through matter.
-        tolerance: largest change of the transmitted light, as a share of the open beam.
+        thickness: longest path through the sample in mm.
+        tolerance: largest change of the transmitted intensity, as a share of the open beam.
 
     Returns:
-        All energies where fewer do not suffice, or are not found.
+        All energies are returned if fewer energies are not enough, or if none are found.
     """
     from scipy.optimize import nnls  # half a second
 

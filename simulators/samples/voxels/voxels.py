@@ -1,6 +1,7 @@
 """Voxels: a sample defined by a volume of attenuation, from a file or a reconstruction, with labels.
 
-The sample is the linear interpolation between the voxels' centres, for projections and truth alike. In a scene:
+The sample is the linear interpolation between the centres of the voxels, both for projections and for the ground truth.
+In a scene:
 
 phantom:
   kind: volume
@@ -30,7 +31,7 @@ from simulators.samples.sample import ReadVolume, Stored
 from simulators.samples.voxels.projector import padded, project
 
 MOST_LABELS = 255
-ON = 1e-9  # Voxels: a point closer than this to a centre counts as on it
+ON = 1e-9  # a point that is closer than this to a centre counts as being on it, in voxels
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,7 @@ class Voxels:
     Attributes:
         padded: float32 [z + 2, y + 2, x + 2], 1/mm, with one voxel of zeros on all sides.
         spacing: mm from voxel to voxel along (z, y, x).
-        thresholds: 1/mm, ascending: label k from the k-th on; None if there is a `label_volume`.
+        thresholds: in 1/mm, ascending; label k begins at the k-th threshold. None if there is a `label_volume`.
         label_volume: uint8 [z, y, x]. names: names of the labels 1, 2, ... radius: mm from the rotation axis to the
             farthest material.
     """
@@ -63,16 +64,16 @@ class Voxels:
     ) -> Voxels:
         """
         Args:
-            attenuation: [z, y, x] in 1/mm; the rotation axis goes up through the middle.
-            spacing: mm from voxel to voxel, one for all or along (z, y, x).
-            thresholds: 1/mm, ascending: a label begins at each. Without them and `labels`, every voxel above 0 is
-            matter.
+            attenuation: [z, y, x] in 1/mm; the rotation axis goes through the middle.
+            spacing: distance between voxels in mm, one value or (z, y, x).
+            thresholds: in 1/mm, ascending; a label begins at each. Without thresholds and without `labels`, every voxel
+                above 0 is material.
             labels: [z, y, x], 0 ... 255; 0 is air.
-            names: of the labels from 1 on; empty: numbers.
+            names: names of the labels from 1 on; empty: labels are named by their numbers.
 
         Raises:
-            ValueError: not a volume, values that are not finite, lengths that are not positive, thresholds that do not
-                ascend, labels of another shape, or too few names.
+            ValueError: the array is not a volume, values are not finite, lengths are not positive, thresholds are not
+                ascending, labels have another shape, or there are too few names.
         """
         along = spacing if isinstance(spacing, tuple) else (spacing, spacing, spacing)
         if attenuation.ndim != 3 or 0 in attenuation.shape:
@@ -108,7 +109,7 @@ class Voxels:
 
     @property
     def first(self) -> tuple[float, float, float]:
-        """mm (z, y, x), centre of the first voxel."""
+        """Centre (z, y, x) of the first voxel in mm."""
         z, y, x = (-(n - 3) / 2 * step for n, step in zip(self.padded.shape, self.spacing, strict=True))
         return z, y, x
 
@@ -116,8 +117,8 @@ class Voxels:
         """See Sample.line_integrals.
 
         Raises:
-            ValueError: the pose has another number of rows.
-            CannotExposeError: a cone's source lies inside the volume.
+            ValueError: the number of rows of the pose is wrong.
+            CannotExposeError: the source of a cone beam lies inside the volume.
         """
         pose = angle if isinstance(angle, Pose) else Pose.turned(angle, detector.shape[0])
         if pose.angle.size != detector.shape[0]:
@@ -149,7 +150,7 @@ class Voxels:
         return self._mean(grid, points)
 
     def labels(self, grid: Grid) -> NDArray[np.uint8]:
-        """See Sample.labels: of the nearest voxel, or from the attenuation at the centre."""
+        """See Sample.labels. The label is that of the nearest voxel, or follows from the attenuation at the centre."""
         if self.label_volume is None:
             steps = np.array(self.thresholds, dtype=np.float32)
             return np.searchsorted(steps, self._mean(grid, [1, 1, 1]), side="right").astype(np.uint8)
@@ -165,8 +166,9 @@ class Voxels:
         return out
 
     def _mean(self, grid: Grid, points: Sequence[int]) -> NDArray[np.float32]:
-        """Mean over `points` per side (z, y, x) in each voxel, float32 [z, y, x]. The mean is separable: there is one
-        sparse matrix for each axis."""
+        """Mean over `points` positions per side (z, y, x) in each voxel, float32 [z, y, x]. The mean is separable:
+        there is one sparse matrix for each axis.
+        """
         values = self.padded
         for axis, centres in enumerate(grid.coordinates()):
             weights = _weights(
@@ -182,7 +184,7 @@ def _weights(centres: NDArray[np.float64], edge: float, points: int, first: floa
     """Matrix [target, padded voxel] that interpolates along one axis and takes the mean over each target voxel."""
     within = (np.arange(points) + 0.5) / points - 0.5
     place = (centres[:, None] + within * edge - first) / step + 1.0
-    # Exactly the value of the voxel at its centre: a rounded share of its neighbour would count as material.
+    # Exactly the value of the voxel at its centre, because a rounded share of its neighbour would count as material.
     place = np.where(np.abs(place - np.rint(place)) < ON, np.rint(place), place)
     below = np.floor(place)
     rows = np.repeat(np.arange(centres.size), points)
@@ -195,7 +197,7 @@ def _weights(centres: NDArray[np.float64], edge: float, points: int, first: floa
 
 
 def _radius(volume: NDArray[np.float32], spacing: tuple[float, float, float]) -> float:
-    """mm to the farthest voxel with material; the interpolation ends one voxel beyond it."""
+    """Distance in mm to the farthest voxel with material. The interpolation ends one voxel beyond it."""
     y, x = np.nonzero((volume != 0).any(axis=0))
     if not x.size:
         return 0.0
@@ -205,7 +207,7 @@ def _radius(volume: NDArray[np.float32], spacing: tuple[float, float, float]) ->
 
 
 MOST_COLUMNS = 100_000
-VIEWS = 8  # Views over 180 degrees in which the largest line integral is searched
+VIEWS = 8  # number of projections over 180 degrees in which the largest line integral is searched
 
 
 @dataclass(frozen=True)
@@ -219,10 +221,12 @@ class VolumeSettings:
             clipped.
         scale: the factor itself, 1/mm per unit of the file.
         attenuation_max: attenuation in 1/mm at the upper end of the window, or of the largest value.
-            largest_line_integral: dimensionless, the largest over rays of 8 projections, one voxel apart.
-        thresholds: file's values, ascending, at which labels 1, 2, ... begin.
-        labels: a file of labels 0 ... 255 of the same shape, instead of thresholds; `labels_dataset` in it.
-        names: of the labels.
+            largest_line_integral: largest line integral (no unit) over the rays of 8 projections that are one voxel
+                apart.
+        thresholds: values of the file, ascending, at which the labels 1, 2, ... begin.
+        labels: a file of labels 0 ... 255 with the same shape, instead of thresholds; `labels_dataset` is the dataset
+            in it.
+        names: names of the labels.
     """
 
     file: str
@@ -309,7 +313,7 @@ def _factor(values: NDArray[np.float32], spacing: tuple[float, float, float], se
                 "attenuation_max"
             )
         detector = Detector.centred((planes, across), pitch)
-        # Each row projects one plane of voxels, at any distance between planes. Sums between planes are not larger.
+        # Each row projects one plane of voxels; planes may be at any distance. Sums between planes are not larger.
         shift = np.zeros((planes, 3))
         shift[:, 2] = detector.v() * (1 - spacing[0] / pitch)
         poses = (Pose.turned(k * math.pi / VIEWS, planes).shifted_by(shift) for k in range(VIEWS))

@@ -18,14 +18,14 @@ OVER_RANGE = 9.9e37
 
 
 class ElectrometerWire(BytesWire):
-    """A wire.
+    """The simulated electrometer at the other end of a serial cable.
 
     Args:
-        current: A, as a function of the time in s since 1970.
-        end: of lines, both ways.
-        latency: s that a reading takes.
-        silent: readings (from 0) that get no answer.
-        spoilt: readings that get these bytes in the place of an answer.
+        current: function of the time (s since 1970) that returns the current in A.
+        end: line end of requests and replies.
+        latency: duration of a reading in s.
+        silent: readings (counted from 0) that get no answer.
+        spoilt: readings that get these bytes instead of an answer.
     """
 
     def __init__(

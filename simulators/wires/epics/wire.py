@@ -26,14 +26,14 @@ DONE, AT_HIGH, PROBLEM, AT_LOW, HOMED = 0x2, 0x4, 0x200, 0x2000, 0x4000  # Bits 
 
 @dataclass(frozen=True)
 class EpicsBuild:
-    """How the record is configured, in its unit, and where its switches are.
+    """Configuration of the record, in its unit, and the positions of its switches.
 
     Attributes:
-        counts_per_turn: steps for 360 of its unit.
-        low, high: soft limits; both 0: it has none.
-        fastest: VMAX; 0: none.
-        home_at: step at which its home switch is.
-        switch_at: step at which its upper limit switch ends a move.
+        counts_per_turn: number of steps for 360 of its unit.
+        low, high: soft limits; both 0: there are no soft limits.
+        fastest: VMAX; 0: no limit.
+        home_at: step at which the home switch is.
+        switch_at: step at which the upper limit switch ends a move.
         late: s from the write of VAL until DMOV becomes 0, as with a slow IOC.
         early: s before the end of a move at which DMOV becomes 1.
     """
@@ -89,11 +89,11 @@ class MotorRecord(BytesWire):
 
     @property
     def suffixes(self) -> list[str]:
-        """Its fields."""
+        """The names of the fields."""
         return [*self.state, *self._moved]
 
     def read(self, suffix: str) -> PvValue:
-        """The present value of a field. KeyError: it has no such field."""
+        """The present value of a field. Raises KeyError if the record has no such field."""
         with self._lock:
             if (moved := self._moved.get(suffix)) is not None:
                 return PvValue(moved(), "", 3 if self.broken else 0)
@@ -101,7 +101,7 @@ class MotorRecord(BytesWire):
             return PvValue(value, labels[int(value)] if labels else "")
 
     def write(self, suffix: str, value: float | str) -> None:
-        """Set a field, as a client does; a disabled record ignores it. KeyError: the field cannot be set."""
+        """Set a field, as a client does; a disabled record ignores it. Raises KeyError if the field cannot be set."""
         with self._lock:
             if self.state[".DISP"] and suffix != ".DISP":
                 return
@@ -131,7 +131,7 @@ class MotorRecord(BytesWire):
 
     def _search(self, wanted: float) -> None:
         if wanted:
-            self._homed = True  # set by the end of the move; a stop removes it
+            self._homed = True  # set at the end of the move; a stop removes it
             self._start(self._build.home_at)
 
     def _shows_motion(self) -> bool:

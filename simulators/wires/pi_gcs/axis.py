@@ -30,19 +30,19 @@ class GcsError(Exception):
 
 @dataclass(frozen=True)
 class PiAxisBuild:
-    """How this axis is built, and its faults.
+    """Properties of the simulated axis, and its faults.
 
     Attributes:
         low, high: travel range and limit switches, degrees.
-        found_at: degrees of true angle at which it is switched on.
+        found_at: true angle in degrees at which the axis is switched on.
         referenced: True: its zero is already the reference switch; False: its zero is its position at switching on.
         reference_switch, limit_switches: True if the axis has them.
         reference_fails: True: a reference move ends with error 45.
         first_pulse: see `PiFirstPulse`.
-        pulse_width: s that the firmware holds a pulse.
+        pulse_width: duration in s for which the firmware holds a pulse.
         rising: True: the camera at the trigger output reacts to rising edges; False: to falling ones.
         servo_period: s; positions are compared and read once per period. 0: continuously.
-        settle: s after a move until the axis reports to be on target.
+        settle: time in s after a move until the axis reports that it is on target.
         max_velocity, max_acceleration: degrees/s, degrees/s².
         lost: trigger pulses, counted from 0 since power-on, that never reach the line.
         stall_at: a move that would pass this true count ends there with error 1024 and the servo off.

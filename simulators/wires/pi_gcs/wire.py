@@ -34,12 +34,12 @@ def _degrees(angle: float) -> float:
 
 @dataclass(frozen=True)
 class PiGcsBuild:
-    """How the controller is built, and its faults.
+    """Properties of the simulated controller, and its faults.
 
     Attributes:
-        axis: its identifier.
+        axis: identifier of the axis.
         output: the digital output that the trigger cable is in, from 1.
-        latency: s until a reply can be read.
+        latency: time in s until a reply can be read.
         unknown: commands (like "ACC" or "TMN?") that this model does not know.
         spoil: damages replies: (number since power-on, bytes) -> the bytes that arrive.
         specimen: the axis, and its faults.

@@ -73,7 +73,7 @@ class HomeSwitch:
         self._incomplete = self._motor.move.begin
 
     def found(self) -> int | None:
-        """Where the search passed the switch, in counts; None if it did not."""
+        """Position in counts at which the search passed the switch; None if it did not pass the switch."""
         move, home = self._motor.move, self._searched_for
         if home is not None and move.begin == self._incomplete:
             low, high = sorted((round(move.start), self._motor.position()))
@@ -116,13 +116,13 @@ class Channel:
 
 @dataclass(frozen=True)
 class BoxBuild:
-    """How the box is built and what is plugged into it.
+    """Properties of the simulated box, and what is plugged into it.
 
     Attributes:
         channel: the motor that turns the sample; the others turn nothing.
-        counts_per_turn: its pulses for 2π.
-        home_at: where its home switch is, in pulses since power-on; None plugs none in.
-        version: of its firmware.
+        counts_per_turn: number of pulses of this motor for 2π.
+        home_at: position of its home switch, in pulses since power-on; None: no switch is plugged in.
+        version: version of the firmware.
         lost: trigger pulses (from 0, since power-on) that never reach the line.
         stall_at, switch_at: counts at which a move of the sample's motor that would pass stops short, as by an
             interlock or a limit switch.

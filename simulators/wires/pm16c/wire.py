@@ -98,7 +98,7 @@ REMOTE_ONLY: tuple[tuple[str, Setting], ...] = (
 
 @dataclass(frozen=True)
 class PM16CBuild:
-    """How the controller is built, and its faults.
+    """Properties of the simulated controller, and its faults.
 
     Attributes:
         box: the controller behind the wire.
@@ -119,7 +119,7 @@ class PM16CBuild:
 
 
 class PM16CController(BytesWire):
-    """None of its outputs can be set.
+    """The simulated controller at the other end of the cable. None of its outputs can be set.
 
     Args:
         line: the cable in the TP0 connector (position controller A); it also learns the sample's true angle.

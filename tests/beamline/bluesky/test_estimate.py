@@ -10,7 +10,7 @@ import pytest
 
 from beamline import api
 from beamline.plan.timeline import move_seconds
-from beamline.scan.preflight import dry_run
+from beamline.scan.dry_run import dry_run
 from tests.beamline.ball_scan import small
 from tests.beamline.bluesky.short_scan import SHORT
 

@@ -67,7 +67,7 @@ def _recon(scan: Path, output: Path, *options: str) -> tuple[str, str]:
 
 def test_views_of_a_bent_beam_become_those_of_a_straight_one(scans: dict[str, Path]) -> None:
     bent, straight = (_prepared(scans[name]) for name in ("bent", "straight"))
-    assert "subtracted" in bent.done["background"].sentence and straight.done["background"].sentence == ""
+    assert "subtracted" in bent.origin.done["background"].sentence and straight.origin.done["background"].sentence == ""
     left = bent.seen.data - straight.seen.data
     noise = float(np.std(left[:, :8]))
     assert np.abs(left.mean(axis=0)).max() < 0.01 and noise < 0.02
@@ -92,4 +92,4 @@ def test_slabs_share_the_surface_of_the_whole_to_the_bit(scans: dict[str, Path])
     buffer = DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7)
     parts = _prepared(scans["bent"], buffer=buffer)
     np.testing.assert_array_equal(parts.seen.data, whole.seen.data)
-    assert parts.done["background"].sentence == whole.done["background"].sentence
+    assert parts.origin.done["background"].sentence == whole.origin.done["background"].sentence

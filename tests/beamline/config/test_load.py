@@ -9,6 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from beamline.config import load as config
+from beamline.config.planned import plan_of
 from beamline.core.errors import ConfigError
 from beamline.plan.passes import Choice
 from beamline.plan.plan import Mode, Place
@@ -18,7 +19,7 @@ from tests.beamline.config_file import CONFIGS, GOOD, faults, load, write
 @pytest.mark.parametrize("name", CONFIGS)
 def test_shipped_configurations_are_valid(name: str) -> None:
     loaded = config.load(config.config_folder() / f"{name}.yaml", environment={})
-    assert config.plan_of(loaded).angles.size == loaded.scan.angles.views  # type: ignore[union-attr]
+    assert plan_of(loaded).angles.size == loaded.scan.angles.views  # type: ignore[union-attr]
     assert loaded.simulated == (name != "instrument")
 
 
@@ -155,22 +156,20 @@ def test_plan_of_every_scheme(tmp_path: Path) -> None:
         ("{scheme: interlaced, views: 8, passes: 2}", 0, 157.5, 8),
         ("{scheme: golden, views: 2}", 0, 180 * (math.sqrt(5) - 1) / 2, 2),
     ):
-        plan = config.plan_of(load(path, f"scan.angles={angles}"))
+        plan = plan_of(load(path, f"scan.angles={angles}"))
         assert plan.angles.size == n
         np.testing.assert_allclose(np.rad2deg(plan.angles[[0, -1]]), [first, last])
-    seeded = [
-        config.plan_of(load(path, f"scan.angles={{scheme: random, views: 9, seed: {s}}}")).angles for s in (1, 1, 2)
-    ]
+    seeded = [plan_of(load(path, f"scan.angles={{scheme: random, views: 9, seed: {s}}}")).angles for s in (1, 1, 2)]
     np.testing.assert_array_equal(seeded[0], seeded[1])
     assert not np.array_equal(seeded[0], seeded[2])
     # An angle file is found beside the configuration file, wherever the command runs.
     beside = write(tmp_path, GOOD.replace("{scheme: fixed, views: 12}", "{scheme: file, path: angles.txt}"), "b.yaml")
-    np.testing.assert_allclose(config.plan_of(load(beside)).angles, [0, math.pi / 4])
+    np.testing.assert_allclose(plan_of(load(beside)).angles, [0, math.pi / 4])
 
 
 def test_several_frames_a_view_are_of_a_step_scan_that_takes_none_again(tmp_path: Path) -> None:
     path = write(tmp_path)
-    plan = config.plan_of(load(path, "scan.mode=step", "scan.frames_per_view=3"))
+    plan = plan_of(load(path, "scan.mode=step", "scan.frames_per_view=3"))
     assert (plan.n_views, plan.angles.size) == (12, 36)
     np.testing.assert_array_equal(plan.angles.reshape(12, 3).T, [plan.angles[::3]] * 3)
     with pytest.raises(ConfigError, match=r"scan\.mode"):

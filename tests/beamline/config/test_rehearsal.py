@@ -9,7 +9,7 @@ import pytest
 from beamline.config.load import Config, config_folder, load
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event
-from beamline.scan.preflight import dry_run
+from beamline.scan.dry_run import dry_run
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from beamline.cli.main import main
 from beamline.config import load as config
 from beamline.core.quantities import RANGES, doubt, is_impossible, range_of
-from beamline.scan.preflight import doubts
+from beamline.scan.dry_run import doubts
 
 
 def numbers_of(schema: Mapping[str, Any]) -> set[str]:

@@ -10,7 +10,7 @@ from typing import Any, cast
 import pytest
 
 from beamline.config import load as config
-from beamline.config.load import camera_settings
+from beamline.config.planned import camera_settings
 from beamline.config.stages import StageSection
 from beamline.core.errors import ConfigError
 from beamline.core.stop import ScanAborted

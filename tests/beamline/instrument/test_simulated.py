@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from beamline.config.load import camera_settings
 from beamline.config.models import Config, Speed
+from beamline.config.planned import camera_settings
 from beamline.core.errors import ConfigError
 from beamline.instrument import connect as devices
 from beamline.instrument.simulated import clock_of
 from beamline.plan.plan import Block
 from beamline.plan.timeline import block_seconds
-from beamline.scan.preflight import dry_run
+from beamline.scan.dry_run import dry_run
 from drivers.base.clock import SystemClock
 from drivers.base.protocols import TriggerSource
 from recon.base.geometry import Geometry

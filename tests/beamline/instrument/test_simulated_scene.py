@@ -14,7 +14,7 @@ from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.projections.views import select
-from beamline.scan.preflight import dry_run
+from beamline.scan.dry_run import dry_run
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from beamline.instrument import connect as devices
-from beamline.scan.preflight import dry_run
+from beamline.scan.dry_run import dry_run
 from drivers.base.errors import DeviceRefused
 from tests.beamline.ball_scan import COMMON, STAGES, small
 

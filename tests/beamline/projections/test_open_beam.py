@@ -63,7 +63,7 @@ def test_few_photons_are_unbiased_where_their_logarithm_is_not() -> None:
     assert logarithm.views.weights is None
     assert abs(np.average((counted.seen.data - EXACT)[behind], weights=weights[behind])) < 0.03
     assert np.mean((logarithm.seen.data - EXACT)[behind]) > 0.1
-    assert "10" in counted.done["noise"].sentence and logarithm.done["noise"].sentence == ""
+    assert "10" in counted.origin.done["noise"].sentence and logarithm.origin.done["noise"].sentence == ""
 
 
 @pytest.mark.parametrize(("photons", "noise", "counted"), [
@@ -105,7 +105,7 @@ def test_weights_follow_the_views_and_pixels_that_are_left() -> None:
 
 
 def test_one_flat_does_not_tell_the_gain() -> None:
-    assert prepare(scan(20, n_flats=1), PLAIN)[0].done["noise"].sentence == ""
+    assert prepare(scan(20, n_flats=1), PLAIN)[0].origin.done["noise"].sentence == ""
     with pytest.raises(ConfigError, match="--gain COUNTS"):
         prepare(scan(20, n_flats=1), PLAIN.with_steps(Preparation(noise="counts")))
 

@@ -29,11 +29,15 @@ def test_counts_become_line_integrals_with_the_axis_found(tmp_path: Path) -> Non
     prepared, warnings = prepare(path, FOUND)
     # A count of 20000 is rounded to a half: 2.5e-5 of transmission near 1, less than 1e-4 of a line integral below 1.
     np.testing.assert_allclose(prepared.seen.data, SCAN.line_integrals(), atol=1e-4)
-    assert prepared.axis_col == pytest.approx(SCAN.axis_col, abs=0.25)
-    assert prepared.geometry.axis_col == prepared.axis_col
+    assert prepared.origin.axis_col == pytest.approx(SCAN.axis_col, abs=0.25)
+    assert prepared.geometry.axis_col == prepared.origin.axis_col
     np.testing.assert_allclose(prepared.geometry.angles, SCAN.angles)
     assert prepared.lines.unseen is None
-    assert (prepared.length_unit, prepared.quantity, prepared.n_projections) == ("mm", "counts", 45)
+    assert (prepared.origin.length_unit, prepared.origin.quantity, prepared.origin.n_projections) == (
+        "mm",
+        "counts",
+        45,
+    )
     assert warnings == []
 
 
@@ -56,7 +60,7 @@ def test_rows_and_bins(tmp_path: Path, rows: tuple[int, int] | None, binning: in
     assert prepared.geometry.detector_shape == shape == expected.detector_shape
     assert prepared.geometry.axis_col == expected.axis_col
     assert prepared.geometry.pixel_pitch == 0.5 * binning
-    assert prepared.axis_col == 20.7
+    assert prepared.origin.axis_col == 20.7
     # Counts are averaged, then the logarithm taken.
     transmission = np.exp(-SCAN.line_integrals())[:, : shape[0] * binning, : shape[1] * binning]
     mean = transmission.reshape(45, shape[0], binning, shape[1], binning).mean(axis=(2, 4))
@@ -66,15 +70,15 @@ def test_rows_and_bins(tmp_path: Path, rows: tuple[int, int] | None, binning: in
 def test_auto_axis_of_binned_views_is_in_full_columns(tmp_path: Path) -> None:
     path = write_exchange(tmp_path / "scan.h5", TwoCylinders(shape=(2, 80), axis_col=40.7))
     prepared, _ = prepare(path, replace(FOUND, binning=2))
-    assert prepared.axis_col == pytest.approx(40.7, abs=0.5)
-    assert prepared.geometry.axis_col == pytest.approx((prepared.axis_col - 0.5) / 2)
+    assert prepared.origin.axis_col == pytest.approx(40.7, abs=0.5)
+    assert prepared.geometry.axis_col == pytest.approx((prepared.origin.axis_col - 0.5) / 2)
 
 
 def test_selected_views_and_views_held_out(tmp_path: Path) -> None:
     path = write_exchange(tmp_path / "scan.h5", SCAN)
     prepared, _ = prepare(path, replace(GIVEN, views="first:10"))
     assert prepared.geometry.n_views == 10
-    assert prepared.n_projections == 45
+    assert prepared.origin.n_projections == 45
     np.testing.assert_array_equal(prepared.ids, np.arange(4, 14))  # 2 darks and 2 flats come first
     assert prepared.lines.unseen is not None
     data, geometry = prepared.lines.unseen.data, prepared.lines.unseen.geometry
@@ -159,7 +163,7 @@ def test_line_integrals_pass_as_they_are(tmp_path: Path) -> None:
     data[3, 1, 20] = np.nan
     path = write_exchange(tmp_path / "scan.h5", SCAN, {"data": data, "data_white": None, "data_dark": None})
     prepared, _ = prepare(path, Selection(), quantity="line_integrals")
-    assert prepared.quantity == "line_integrals"
+    assert prepared.origin.quantity == "line_integrals"
     left, right = data[3, 1, 19], data[3, 1, 21]
     assert prepared.seen.data[3, 1, 20] in (data[3, 0, 20], data[3, 2, 20], left, right)
     data[3, 1, 20] = prepared.seen.data[3, 1, 20]
@@ -175,18 +179,18 @@ def test_a_doubtful_axis_is_used_aloud_unless_the_file_knows(monkeypatch: pytest
     monkeypatch.setattr(axis_module, "axis_by_views", lambda data, geometry, lit: _estimate(17.0, False))
     source = counted(SCAN.counts(), SCAN.angles)
     prepared, warnings = prepare(source, FOUND)
-    assert prepared.axis_col == 18.0
+    assert prepared.origin.axis_col == 18.0
     assert any("18.00, is not a clear optimum" in text and "--axis" in text for text in warnings)
     source.axis_col = 20.5
     prepared, warnings = prepare(source, FOUND)
-    assert prepared.axis_col == 20.5
+    assert prepared.origin.axis_col == 20.5
     assert any("the file's column 20.50 is used" in text for text in warnings)
 
 
 def test_a_doubtful_axis_gives_way_to_one_that_views_held_out_confirm(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(axis_module, "find_axis", lambda data, angles: _estimate(18.0, False))
     prepared, warnings = prepare(counted(SCAN.counts(), SCAN.angles), FOUND)
-    assert prepared.axis_col == pytest.approx(SCAN.axis_col, abs=0.2)
+    assert prepared.origin.axis_col == pytest.approx(SCAN.axis_col, abs=0.2)
     assert not any("axis" in text for text in warnings)
 
 
@@ -200,9 +204,9 @@ def test_a_doubtful_axis_gives_way_to_one_that_views_held_out_confirm(monkeypatc
 )
 def test_axis_of_measured_scans(shared_data: Path, name: str, expected: float, tolerance: float) -> None:
     prepared, _ = prepare(shared_data / name, Selection())
-    assert prepared.axis_col == pytest.approx(expected, abs=tolerance)
-    assert prepared.axis is not None
-    assert prepared.axis.confident
+    assert prepared.origin.axis_col == pytest.approx(expected, abs=tolerance)
+    assert prepared.origin.axis is not None
+    assert prepared.origin.axis.confident
     assert np.isfinite(prepared.seen.data).all()
 
 
@@ -224,8 +228,12 @@ def test_what_stands_in_the_beam_of_all_views_is_not_measured_and_becomes_no_wal
     prepared, warnings = prepare(counted(counts, scan.angles, dtype=np.float32), FOUND)
     lost = "30.0% of the detector got no beam or is saturated. The rays of these pixels count as missing data."
     assert lost in warnings
-    assert prepared.measured is not None and not prepared.measured[:, :12].any() and prepared.measured[:, 12:].all()
-    assert prepared.axis_col == pytest.approx(scan.axis_col, abs=0.3)
+    assert (
+        prepared.sources.measured is not None
+        and not prepared.sources.measured[:, :12].any()
+        and prepared.sources.measured[:, 12:].all()
+    )
+    assert prepared.origin.axis_col == pytest.approx(scan.axis_col, abs=0.3)
     views = replace(prepared.views, weights=prepared.views.weights[...])
     volume = recon.reconstruct(views, method="fista-tv").volume
     truth = scan.truth(volume.grid)

@@ -75,7 +75,7 @@ def test_rows_that_no_ray_measured_are_told_by_these_views_and_beside_masked_are
     runs = [[view, 0, *ends] for view in ids for ends in ((0, 10), (20, 40))]
     runs += [[view, 1, 0, 40] for view in ids[::2]]
     dark = replace(everything.corrected, unmeasured=np.array(runs, np.int64))
-    everything = replace(everything, corrected=dark, measured=measured)
+    everything = replace(everything, corrected=dark, sources=replace(everything.sources, measured=measured))
     even, odd = (everything.of_views(np.arange(first, ids.size, 2)) for first in (0, 1))
     for views, lost in (everything, [0]), (even, [0, 1]), (odd, [0]):
         assert [found.tolist() for found in views.unmeasured_rows] == [lost, []]

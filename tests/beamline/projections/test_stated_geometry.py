@@ -108,7 +108,7 @@ def nxtomo(path: Path, made: Instrument, *more: Put) -> Path:
 def volume(path: Path) -> Volume:
     """By the direct method, in mm."""
     prepared, _ = prepare(path, Selection(steps=(Air("none"),)))
-    assert prepared.length_unit == "mm"
+    assert prepared.origin.length_unit == "mm"
     return prepared.stretched(recon.reconstruct(prepared.seen.data, prepared.geometry, "fbp").volume)
 
 

@@ -12,7 +12,6 @@ from beamline.projections.scan_warnings import cut_sentence
 from beamline.projections.selection import Selection
 from recon.base.geometry import Geometry
 from recon.base.view_data import Views
-from recon.voxels.fbp import fbp
 from recon.voxels.field_edges import edges_of
 from tests.beamline.array_source import ArraySource, scan_of
 from tests.beamline.prepared_views import prepare
@@ -37,17 +36,12 @@ def scan(radius: float, light: np.ndarray | float = 1.0, beside: float = 0.0) ->
     return scan_of(darks, flats, views, ANGLES)
 
 
-@pytest.mark.parametrize("radius", others_slow([45.0, 90.0, 180.0]))
-def test_a_sample_wider_than_the_field_keeps_its_density_and_is_named(radius: float) -> None:
-    found, (line,) = prepare(scan(radius), SELECTION)
+def test_a_sample_wider_than_the_field_is_named_and_its_edges_are_not_air() -> None:
+    found, (line,) = prepare(scan(45.0), SELECTION)
     assert found.corrected.air_columns == (0, 0)
     assert line.startswith(
         "The sample extends beyond the left and right edge of the field of view (line integral there: "
     )
-    volume = fbp(found.seen.data, found.geometry, filter="hann")[1]
-    c = (np.arange(64) - 31.5)[None]
-    middle = volume[np.hypot(c, c.T) < 28].mean()
-    assert middle == pytest.approx(MU, rel=0.1)
 
 
 def test_that_fbp_continues_the_views_is_said_where_it_does() -> None:

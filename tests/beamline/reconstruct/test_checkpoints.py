@@ -17,6 +17,8 @@ from beamline.reconstruct.checkpoints import CheckpointOptions, differences, ori
 from beamline.storage.writers.recon_file import Checkpoint, write_checkpoint
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
+from recon.base.volume import Grid, Volume
+from recon.features.reference.methods import FromReference
 from recon.splatting import optimise as fit
 from recon.splatting.checkpoint import arrays_of
 from recon.splatting.gaussians import Gaussians
@@ -58,7 +60,7 @@ CHANGES: dict[str, tuple[Callable[[PreparedProjections], PreparedProjections], F
     "angles": (_turned, SETTINGS, OTHERS),
     "axis_col": (lambda p: _seen_by(p, replace(p.geometry, axis_col=20.0)), SETTINGS, OTHERS),
     "pixel_pitch": (lambda p: _seen_by(p, replace(p.geometry, pixel_pitch=2.0)), SETTINGS, OTHERS),
-    "length_unit": (lambda p: replace(p, length_unit="px"), SETTINGS, OTHERS),
+    "length_unit": (lambda p: p.stating(length_unit="px"), SETTINGS, OTHERS),
     "loss": (lambda p: p, replace(SETTINGS, loss="l2"), OTHERS),
     "kernel": (lambda p: p, replace(SETTINGS, kernel=OTHER), OTHERS),
     "policy": (lambda p: p, replace(SETTINGS, policy=None), OTHERS),
@@ -73,6 +75,16 @@ def test_every_change_is_told_by_its_name(prepared: PreparedProjections, name: s
     change, settings, others = CHANGES[name]
     found = differences(origin_of(change(prepared), settings, others), before)
     assert [said.split(" ")[0] for said in found] == [name]
+
+
+def test_another_reference_is_told(prepared: PreparedProjections) -> None:
+    grid = Grid((4, 8, 8))
+    volume = np.random.default_rng(1).random(grid.shape).astype(np.float32)
+    other = volume.copy()
+    other[2, 4, 4] += 0.1
+    first, second = (origin_of(prepared, FromReference(Volume(each, grid)), {}) for each in (volume, other))
+    assert [said.split(" ")[0] for said in differences(second, first)] == ["reference"]
+    assert not differences(origin_of(prepared, FromReference(Volume(volume.copy(), grid)), {}), first)
 
 
 def _state(**changes: Any) -> dict[str, Any]:

@@ -252,7 +252,7 @@ def test_the_pass_before_wide_views_is_not_measured_again_and_they_are_among_the
     prepared = scan.follower.end().prepared
     assert prepared.geometry.is_centred.tolist() == [True] * 10 + [False] * 3
     np.testing.assert_allclose(prepared.geometry.shifts[:, 0] * prepared.geometry.pixel_pitch, [0] * 10 + [18.0] * 3)
-    assert (prepared.n_projections, prepared.centred.geometry.n_views) == (10, 10)
+    assert (prepared.origin.n_projections, prepared.centred.geometry.n_views) == (10, 10)
 
 
 def test_a_view_that_was_taken_again_has_no_part_though_the_fit_has_learnt_it(

@@ -17,7 +17,7 @@ from beamline.features.tuning.tune import tune
 from beamline.instrument import connect as devices
 from beamline.instrument.connect import ConnectedDevices
 from beamline.instrument.states import device_states
-from beamline.scan.preflight import dry_run
+from beamline.scan.dry_run import dry_run
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
 from drivers.base.errors import DeviceError

@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
 from beamline.config.load import config_folder, load
-from beamline.scan.preflight import dry_run
+from beamline.scan.dry_run import dry_run
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind
 from simulators.devices.camera import SimulatedOrcaQuest

@@ -2,7 +2,8 @@
 
 import pytest
 
-from beamline.config.load import config_folder, load, plan_of
+from beamline.config.load import config_folder, load
+from beamline.config.planned import plan_of
 from beamline.scan.live_plan import better_order, live_need, live_plan
 
 

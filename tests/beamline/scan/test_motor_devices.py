@@ -12,7 +12,8 @@ from beamline.core.events import Event
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.instrument import connect as devices
 from beamline.scan.acquisition import Acquisition
-from beamline.scan.preflight import dry_run, preflight
+from beamline.scan.dry_run import dry_run
+from beamline.scan.preflight import preflight
 from beamline.scan.run import run_scan
 from drivers.base.errors import DeviceTimeout
 from drivers.base.frame import Frame, FrameKind

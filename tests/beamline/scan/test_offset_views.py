@@ -7,8 +7,8 @@ import h5py
 import numpy as np
 import pytest
 
-from beamline.config.load import offset_places, plan_of
 from beamline.config.models import Config
+from beamline.config.planned import offset_places, plan_of
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Event
 from beamline.core.stop import StopRequest
@@ -25,7 +25,7 @@ from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.reconstruct.run import views_for
 from beamline.reconstruct.scan_facts import MadeVolume
 from beamline.reconstruct.volume_checks import check_volume
-from beamline.scan.preflight import dry_run
+from beamline.scan.dry_run import dry_run
 from beamline.scan.resume import open_for_resume
 from beamline.scan.run import run_scan
 from beamline.storage.pose_table import read_poses

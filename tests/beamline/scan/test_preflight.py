@@ -13,7 +13,7 @@ from beamline.config.load import config_folder, load
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event
 from beamline.instrument.connect import connect
-from beamline.scan.preflight import disk_of, dry_run, refuse_violations
+from beamline.scan.dry_run import disk_of, dry_run, refuse_violations
 from beamline.scan.run import run_scan
 from tests.beamline.ball_scan import shipped
 from tests.beamline.fakes import FakeInstrument
@@ -69,7 +69,7 @@ def test_violations_are_refused_all_at_once() -> None:
 
 def test_instrument_loads_no_simulator_and_a_dry_run_no_vendor_library() -> None:
     code = (
-        "import sys; from beamline.config import load as config; from beamline.scan.preflight import dry_run;"
+        "import sys; from beamline.config import load as config; from beamline.scan.dry_run import dry_run;"
         "d = dry_run(config.load(config.config_folder() / 'instrument.yaml', (), {})); assert d.lines();"
         "bad = [m for m in sys.modules if m.startswith(('simulators', 'drivers.dcam', 'torch'))]; assert not bad, bad"
     )

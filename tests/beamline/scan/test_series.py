@@ -18,7 +18,7 @@ from beamline.cli.main import main
 from beamline.config.load import config_folder, each_scan, load
 from beamline.features.files.validate import validate
 from beamline.scan.control import State, Verb, running, state_of, tell
-from beamline.scan.preflight import dry_run
+from beamline.scan.dry_run import dry_run
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind
 from simulators.devices.camera import SimulatedOrcaQuest

@@ -109,7 +109,7 @@ import os, sys
 from pathlib import Path
 from beamline.config.load import load
 from beamline.core.errors import DataError
-from beamline.scan.preflight import dry_run
+from beamline.scan.dry_run import dry_run
 from beamline.features.files.validate import describe
 from beamline.storage.writers.layout import ScanInfo
 from beamline.storage.writers.nxtomo import NXtomoWriter

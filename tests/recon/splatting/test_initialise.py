@@ -50,15 +50,6 @@ def test_nothing_is_placed_outside_the_field(rng: np.random.Generator) -> None:
     assert np.hypot(*placed.means.numpy()[:, :2].T).max() < 2.0 + 0.5
 
 
-@pytest.mark.parametrize(("half", "leaves"), [(8.0, False), (10.0, False), (16.0, True), (30.0, True)])
-def test_a_sample_wider_than_the_field_is_noticed(half: float, leaves: bool) -> None:
-    angles = np.linspace(0, np.pi, 8, endpoint=False)
-    views = Geometry.parallel(angles, (3, 24))
-    u = np.arange(24) - 11.5
-    chords = 2 * np.sqrt(np.maximum(half**2 - u**2, 0)).astype(np.float32)
-    assert bool(edges_of(Views(np.broadcast_to(chords, (8, 3, 24)), views)).beyond(0.0)) == leaves
-
-
 def test_the_edge_near_an_axis_off_the_middle_does_not_count() -> None:
     views = Geometry.parallel(np.linspace(0, 2 * np.pi, 8, endpoint=False), (3, 24), axis_col=4.0)
     chords = 2 * np.sqrt(np.maximum(15.0**2 - (np.arange(24) - 4.0) ** 2, 0)).astype(np.float32)

@@ -75,11 +75,6 @@ def test_a_sample_within_the_field_gets_the_volume_of_the_method_to_the_bit() ->
     assert made.outside is None and "sample_radius" not in made.settings
 
 
-@pytest.mark.slow
-def test_a_can_as_wide_as_the_field_is_not_taken_for_a_wider_one() -> None:
-    assert whole_reach(Views(views_of(can(COLS / 2)), GEOMETRY)).sample is None
-
-
 def test_the_radius_is_that_of_the_can(found: SampleRadius | None) -> None:
     assert found is not None and found.low <= found.radius <= found.high
     assert 0.88 < found.radius / (1.6 * COLS / 2) < 1.05  # a square as large as the disc has 0.886 of its width
@@ -95,7 +90,6 @@ def test_the_fields_part_is_right_where_a_box_of_the_field_is_far_off(
     assert made.volume.grid == recon.Grid.matching(GEOMETRY)
     assert error(made.volume.data, truth) < 0.9 * error(by_fbp, truth)
     assert error(made.volume.data, truth) < 0.2 * error(alone.volume.data, truth)
-    assert made.volume.data[:, FIELD].mean() == pytest.approx(truth[:, FIELD].mean(), rel=0.05)
 
 
 def test_volume_and_outside_together_explain_the_views(

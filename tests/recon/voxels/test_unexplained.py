@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from recon.base.geometry import Geometry
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
-from recon.voxels.matter_checks import UNEXPLAINED_LIMIT, unexplained
+from recon.voxels.matter_checks import UNEXPLAINED_LIMIT, Unexplained, unexplained
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
@@ -28,8 +28,12 @@ def _views(rng: np.random.Generator, sigma: float = 0.03) -> F32:
     return Projector(VIEWS, GRID).forward(TRUTH) + rng.normal(0, sigma, (60, 8, 64)).astype(np.float32)
 
 
+def _unexplained(volume: Volume, views: Views, rng: np.random.Generator) -> Unexplained | None:
+    return unexplained(volume, views, rng).alone(volume, views.geometry)
+
+
 def test_a_filled_crack_is_seen_where_it_is(rng: np.random.Generator) -> None:
-    found = unexplained(Volume(TOOTH, GRID), Views(_views(rng), VIEWS), rng)
+    found = _unexplained(Volume(TOOTH, GRID), Views(_views(rng), VIEWS), rng)
     assert found is not None and found.share > 2 * UNEXPLAINED_LIMIT
     strong = found.significance < -4  # the volume has too much there
     assert (
@@ -41,7 +45,7 @@ def test_a_filled_crack_is_seen_where_it_is(rng: np.random.Generator) -> None:
 @pytest.mark.parametrize("rings", [0.0, 0.1])
 def test_the_truth_leaves_noise_and_rings(rng: np.random.Generator, rings: float) -> None:
     offsets = np.where(rng.random((8, 64)) < 0.05, rings, 0).astype(np.float32)
-    found = unexplained(Volume(TRUTH, GRID), Views(_views(rng) + offsets, VIEWS), rng)
+    found = _unexplained(Volume(TRUTH, GRID), Views(_views(rng) + offsets, VIEWS), rng)
     assert found is not None and found.share < UNEXPLAINED_LIMIT / 3
 
 
@@ -58,14 +62,14 @@ def test_a_filled_crack_is_seen_by_views_that_step_up_and_down(rng: np.random.Ge
     whole = Projector(tall, box).forward(np.repeat(TRUTH[:1], 60, axis=0))
     views = np.ascontiguousarray(whole[:, 11:19]) + rng.normal(0, 0.03, (60, 8, 64)).astype(np.float32)
     filled = np.where(np.hypot(X, Y) < 26, np.float32(0.04), np.float32(0))[0]
-    closed = unexplained(Volume(np.repeat(filled[None], len(truth), axis=0), grid), Views(views, moved), rng)
-    true = unexplained(Volume(truth, grid), Views(views, moved), rng)
+    closed = _unexplained(Volume(np.repeat(filled[None], len(truth), axis=0), grid), Views(views, moved), rng)
+    true = _unexplained(Volume(truth, grid), Views(views, moved), rng)
     assert closed is not None and true is not None
     assert closed.share > 2 * UNEXPLAINED_LIMIT > UNEXPLAINED_LIMIT > true.share
 
 
 def test_it_is_in_units_of_the_noise(rng: np.random.Generator) -> None:
-    found = unexplained(Volume(TRUTH, GRID), Views(_views(rng), VIEWS), rng)
+    found = _unexplained(Volume(TRUTH, GRID), Views(_views(rng), VIEWS), rng)
     assert found is not None
     inside = np.broadcast_to(np.hypot(X, Y) < 26, TRUTH.shape)
     assert found.significance[inside].std() == pytest.approx(1, abs=0.15)
@@ -74,7 +78,7 @@ def test_it_is_in_units_of_the_noise(rng: np.random.Generator) -> None:
 def test_what_it_is_not_made_for(rng: np.random.Generator) -> None:
     volume, few = Volume(TRUTH, GRID), VIEWS.select(np.arange(10))
     data = _views(rng)
-    assert unexplained(volume, Views(data[:10], few), rng) is None
-    assert unexplained(Volume(np.zeros_like(TRUTH), GRID), Views(data, VIEWS), rng) is None
+    assert _unexplained(volume, Views(data[:10], few), rng) is None
+    assert _unexplained(Volume(np.zeros_like(TRUTH), GRID), Views(data, VIEWS), rng) is None
     cone = Geometry.cone(VIEWS.angles, (8, 64), 1.0, 500.0, 700.0)
-    assert unexplained(volume, Views(data, cone), rng) is None
+    assert _unexplained(volume, Views(data, cone), rng) is None

@@ -27,23 +27,25 @@ if TYPE_CHECKING:
     Spectrum = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 _TUBE = re.compile(r"(\d+(?:\.\d+)?)kV((?:,\w+=\d+(?:\.\d+)?)*)")
-_COLS, _VIEWS = 160, 180  # enough for a curve of three parameters
+_COLS, _VIEWS = 160, 180  # enough projections for a curve with three parameters
 _ROUNDS, _SETTLED = 12, 0.01
-_LEAST_SEEN = 0.01  # relative increase of the largest line integral from which on there is hardening
-_FEWEST, _BUSIEST = 30, 8  # projections, and binned rows, in which hardening is searched for if the user did not ask
-# Reported without being asked: if the correction halves the spread of the total absorption (a quarter of the variance;
-# with 30 projections that is not chance, F test 1e-4), and if it changes densities by this share
+_LEAST_SEEN = 0.01  # relative increase of the largest line integral, from which on there is hardening
+# number of projections, and of binned rows, in which hardening is searched for if the user did not ask for it
+_FEWEST, _BUSIEST = 30, 8
+# Hardening is reported without a request if two conditions are met: the correction halves the spread of the total
+# absorption (a quarter of the variance; with 30 projections this is not chance, F test 1e-4), and it changes densities
+# by this share.
 _EVENED, _MATTERS = 0.5, 0.05
-# by how much more the total absorption may vary afterwards, because the correction also amplifies noise
+# factor by which the total absorption may vary more afterwards, because the correction also amplifies noise
 _AS_EVEN = 1e-3
-_CURVED = 16  # float32 copies of a projection while a curve corrects it
-_RAYS, _VOLUMES = 10, 3  # float32 copies of the projections and of the volume during the fit of a curve
+_CURVED = 16  # number of float32 copies of a projection while a curve corrects it
+_RAYS, _VOLUMES = 10, 3  # number of float32 copies of the projections and of the volume during the fit of a curve
 _NODE = 40_000  # bytes of a curve per energy
-_RIM = 2.0  # voxels: shorter paths through the material are mostly its edges, which are blurred
+_RIM = 2.0  # voxels: shorter paths through the material are mostly its blurred edges
 
 
 def _model(text: str) -> str | None:
-    """`fit` or `material:beam`; None for "none"."""
+    """Parse the option: `fit` or `material:beam`; None for "none"."""
     if text not in ("none", "fit") and not re.fullmatch(r"[^:]+:.+", text):
         raise ValueError(
             f"{text!r} is unknown; expected none, fit or MATERIAL:BEAM, for example Al:60kV,Al=1 (an aluminium "
@@ -58,8 +60,8 @@ class Hardening:
 
     Attributes:
         model: "fit": a curve fitted to the projections; `material:beam` as the user gave it; None: no correction.
-        spectrum: the material's attenuation, in any unit, at the energies of the beam, and the share of each energy
-            in the detected intensity; None: that of `model`.
+        spectrum: the material's attenuation, in any unit, at the energies of the beam, and the share of each energy in
+            the detected intensity; None: computed from `model`.
     """
 
     name: ClassVar[str] = "hardening"
@@ -117,7 +119,7 @@ def in_beam(material: str, beam: str) -> tuple[F64, F64]:
             because their density is needed.
 
     Raises:
-        ValueError: material or beam is unknown or wrong; the message says which.
+        ValueError: the material or the beam is unknown or wrong; the message says which.
     """
     from recon.prep.matter import mass_attenuation, tube_spectrum
 
@@ -139,7 +141,7 @@ def in_beam(material: str, beam: str) -> tuple[F64, F64]:
 
 
 def curve_of(views: F32, geometry: Geometry, step: Hardening) -> tuple[Curve | None, str]:
-    """The hardening curve for a scan's line integrals [view, row, col], and a sentence about it; None for no
+    """The hardening curve for the line integrals [view, row, col] of a scan, and a sentence about it. None: no
     correction.
     """
     from recon.features.beam_hardening import NoCurveError, curve_of_spectrum
@@ -164,7 +166,7 @@ def curve_of(views: F32, geometry: Geometry, step: Hardening) -> tuple[Curve | N
 
 
 def curve_memory(geometry: Geometry, step: Hardening) -> int:
-    """Peak memory in bytes of finding the hardening curve of such projections and applying it."""
+    """Peak memory in bytes for finding the hardening curve of these projections and applying it."""
     from recon.voxels.fbp import fbp_memory
 
     view = _CURVED * 4 * math.prod(geometry.detector_shape)
@@ -181,7 +183,8 @@ def _clearly_seen(views: PreparedProjections) -> str:
     from recon.voxels.field_edges import busiest_rows
 
     data, geometry = (ordinary := views.centred).seen.data, ordinary.geometry
-    plain = geometry.is_straight and not geometry.is_cone and not geometry.shifts.any() and views.measured is None
+    plain = geometry.is_straight and not geometry.is_cone and not geometry.shifts.any()
+    plain = plain and views.sources.measured is None
     if not plain or geometry.n_views < _FEWEST or reach_of(ordinary.seen).beyond:
         return ""
     rows = busiest_rows(data, _BUSIEST * _small(geometry)[1])
@@ -211,18 +214,18 @@ def fit_curve(views: F32, geometry: Geometry) -> tuple[Curve, float, float]:
     is made of projections corrected with the last curve, until the curve no longer changes (after Krumm, Kasperl &
     Franz 2008, NDT & E Int. 41, 242).
 
-    In a single projection, a sample that is denser outside than inside looks like hardening. But all projections of
-    a row have the same total absorption (the first of the Helgason-Ludwig conditions), and a wrong curve violates
-    that.
+    In a single projection, a sample that is denser outside than inside looks like hardening. But all projections of a
+    row must have the same total absorption (the first of the Helgason-Ludwig conditions). With a wrong curve they do
+    not.
 
     Returns:
         The curve, the share of the line integrals that path lengths explain, and the variation of the total
         absorption of corrected projections divided by that of the uncorrected ones.
 
     Raises:
-        NoCurveError: the sample is of several materials, the curve does not converge, or it makes the total
-            absorption vary more. Or the beam is a cone, in which the total absorption need not be the same in all
-            projections.
+        NoCurveError: the sample consists of several materials, the curve does not converge, or the total absorption
+            varies more with it. Also if the beam is a cone, because the total absorption then need not be the same in
+            all projections.
     """
     from recon.features.beam_hardening import NoCurveError, curve_of_paths
     from recon.post import k_means
@@ -268,9 +271,7 @@ def _small(geometry: Geometry) -> tuple[NDArray[np.int64], int, Geometry]:
 
 
 def _unevenness(views: F32) -> float:
-    """How much the total absorption of a row varies between projections, as a share: the median over the rows with
-    material.
-    """
+    """Relative variation of the total absorption of a row between projections; median over the rows with material."""
     mass = views.sum(axis=2, dtype=np.float64)
     mean = mass.mean(axis=0)
     filled = mean > 0.1 * mean.max()

@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     GeometryOf = Callable[[SelectedScan, I64], Geometry]
 
 GEOMETRY = "axis", "roll", "tilt", "shifts"
-GAINS = "gains"  # the one term that changes line integrals, not the geometry
-_COPIES = 24  # float32 copies of the projections used while their geometry is found
+GAINS = "gains"  # the only term that changes line integrals and not the geometry
+_COPIES = 24  # number of float32 copies of the projections while their geometry is determined
 
 
 def _terms(text: str) -> tuple[str, ...]:
-    """A list of terms without "none", in the order in which they are calibrated."""
+    """Parse the option: a list of terms without "none", in the order of their calibration."""
     names = [name.strip() for name in text.split(",")]
     if names == ["none"]:
         return ()
@@ -45,10 +45,10 @@ def _terms(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Calibrate:
-    """Which terms of the geometry, and whether pixel sensitivities, are found from the projections.
+    """Selects the terms of the geometry that are found from the projections, and whether pixel sensitivities are.
 
     Attributes:
-        terms: names; none: nothing.
+        terms: names of the terms; empty: nothing is calibrated.
     """
 
     name: ClassVar[str] = "calibrate"
@@ -82,7 +82,7 @@ class Calibrate:
         return "--calibrate needs a finished scan, because it uses all projections." if self.terms else ""
 
     def memory(self, part: ScanPart) -> StepMemory:
-        if not self.terms:  # nothing of the calibration is loaded
+        if not self.terms:  # avoids loading the calibration
             return StepMemory()
         from recon.features.calibration.gains import gains_memory
 
@@ -121,7 +121,7 @@ class Calibrate:
     ) -> StepDone:
         if not self.terms:
             return StepDone(parameters={})
-        done = [views.done[self.name]] if self.name in views.done else []
+        done = [views.origin.done[self.name]] if self.name in views.origin.done else []
         if GAINS in self.terms:
             done.append(without_learnt_gains(views, progress))
         sentence = " ".join(each.sentence for each in done if each.sentence)
@@ -135,13 +135,14 @@ class Calibrated:
 
     Attributes:
         frames: rows of the file, in order.
-        change: in pixels of the detector, about the middle row of the band.
-        pitch: mm of such a pixel.
-        off_middle: rows from the middle of the band to that of the detector, about which projections roll and tilt.
+        change: the calibrated change of the geometry, in pixels of the detector, about the middle row of the band.
+        pitch: size of such a pixel in mm.
+        off_middle: rows from the middle of the band to the middle of the detector, about which projections roll and
+            tilt.
         pivot: row of the detector about which projections are rolled and tilted, binned and counted from the first
             one used.
-        binning: of the pixels of the band.
-        learnt: with the residuals in held-out projections.
+        binning: binning of the pixels of the band.
+        learnt: the calibration, with the residuals in held-out projections.
     """
 
     frames: I64
@@ -163,8 +164,8 @@ class Calibrated:
 
     def corrected(self, geometry: Geometry, view_ids: I64) -> Geometry:
         """The calibrated geometry of these rows of the file, which may be binned."""
-        at = np.searchsorted(self.frames, view_ids)
-        change = replace(self.change, shifts=self.change.shifts[at], axis=self.axis)
+        index = np.searchsorted(self.frames, view_ids)
+        change = replace(self.change, shifts=self.change.shifts[index], axis=self.axis)
         return with_pivot(change.scaled(self.pitch / geometry.pixel_pitch).applied(geometry), self.pivot)
 
 
@@ -180,10 +181,10 @@ def calibrated(
     Args:
         frames: rows of the file, in order.
         geometry_before: the geometry of frames of a part of the scan, with its rows and binning, before calibration.
-        progress: how many steps are done, of how many at most.
+        progress: function that gets the number of steps done and the largest number of steps.
 
     Raises:
-        DataError: too few projections, or nothing in the beam.
+        DataError: there are too few projections, or no sample is in the beam.
     """
     from beamline.projections.correction import line_integrals_of
     from recon.base.masks import areas
@@ -208,7 +209,7 @@ def calibrated(
 
 
 def _search_memory(part: ScanPart, terms: frozenset[str]) -> int:
-    """Bytes that `calibrated` needs at most."""
+    """Largest memory in bytes that `calibrated` needs."""
     if not terms:
         return 0
     from beamline.projections.correction import at_once_memory
@@ -220,7 +221,7 @@ def _search_memory(part: ScanPart, terms: frozenset[str]) -> int:
 
 
 def _band(scan: SelectedScan) -> SelectedScan:
-    """Rows around the middle of those used, with pixels binned so that a volume of them is quick.
+    """The scan with rows around the middle of the rows used, binned so that a volume is reconstructed quickly.
 
     For a region of interest, the rows around it are those of the whole volume, and the region is cut out.
     """
@@ -240,7 +241,7 @@ def without_learnt_gains(views: PreparedProjections, progress: Progress) -> Step
     from recon.features.calibration.gains import NEAR_AXIS, learn_gains
 
     try:
-        learnt = learn_gains(views.seen.data, views.geometry, views.measured, progress)
+        learnt = learn_gains(views.seen.data, views.geometry, views.sources.measured, progress)
     except ValueError as error:
         raise DataError(f"--calibrate gains: {error}. Omit --calibrate gains, or give --rings instead.") from error
     values = {"learnt_gains_held_out_before": learnt.without, "learnt_gains_held_out_after": learnt.left}

@@ -1,3 +1,3 @@
-"""Projections after the sample moved on its stage."""
+"""Handles projections that were taken after the sample moved on its stage."""
 
 STEPS = {"Jumps": "jumps.jumps"}

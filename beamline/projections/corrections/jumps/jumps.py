@@ -25,13 +25,14 @@ if TYPE_CHECKING:
     from recon.base.arrays import I64
     from recon.base.geometry import Geometry
 
-LEAST = 6  # projections on a side that are enough to decide whether the sample jumped there
-# times the deviation of the longest part's projections: a part in which the sample is in the same place has no more
+LEAST = 6  # number of projections on each side that is enough to decide whether the sample jumped
+# factor on the deviation of the longest part's projections: a part in which the sample is in the same place stays below
+# it
 ALIKE = 1.5
-# share of the deviation of the longest part's projections by which a part may raise it and still count as the same
-# place
+# share of the deviation of the longest part's projections by which another part may raise this deviation and still
+# count as being in the same place
 _ADDS = 0.005
-# upper limits for binned pixels and projections; of parts of `_SHORT` projections all are used
+# upper limits for binned pixels and projections; all projections of parts with at most `_SHORT` projections are used
 _COLS, _ROWS, _VIEWS = 128, 16, 360
 _SHORT = 40
 _REPAIRED = "`--calibrate shifts` uses all projections and finds the position of the sample in each."
@@ -39,8 +40,8 @@ _REPAIRED = "`--calibrate shifts` uses all projections and finds the position of
 
 @dataclass(frozen=True)
 class Jumps:
-    """Leaves out projections after a jump, see `find_jumps`; none if the position of the sample in each projection
-    is stated or calibrated.
+    """Leaves out the projections after a jump, see `find_jumps`. No projection is left out if the position of the
+    sample in each projection is stated or calibrated.
     """
 
     name: ClassVar[str] = "jumps"
@@ -65,11 +66,11 @@ class Jumps:
 
 @dataclass(frozen=True, eq=False)
 class SampleJumps:
-    """The projections that belong together, of a scan in which the sample jumped.
+    """The projections of a scan in which the sample was in the same place, after jumps of the sample were searched for.
 
     Attributes:
-        frames: int64 [view], the rows that are used.
-        sentence: what was done, in a line; empty if there was no jump.
+        frames: int64 [view], rows of the file that are used.
+        sentence: a sentence that says what was done; empty if there was no jump.
     """
 
     frames: I64
@@ -77,7 +78,7 @@ class SampleJumps:
 
     @property
     def done(self) -> StepDone:
-        """What the step did; the volume's file records the jumps, if there were any."""
+        """What the step did. The file of the volume records the jumps."""
         return StepDone(self.sentence, {"jumps": self.sentence} if self.sentence else {}, warned=True)
 
     def corrected(self, geometry: Geometry, view_ids: I64) -> Geometry:
@@ -93,14 +94,14 @@ def find_jumps(
 ) -> SampleJumps:
     """The longest run of projections in which the sample stayed in one place.
 
-    A jump is real in two cases: held-out projections of the longer side are predicted worse by both sides together
-    than by that side alone, or those of the other side are predicted far worse than these. The clearest jump is
-    searched for first, then others on its sides.
+    A jump is real in two cases. (1) Both sides together predict held-out projections of the longer side worse than the
+    longer side alone does. (2) Held-out projections of the other side are predicted far worse than those of the longer
+    side. The clearest jump is searched for first, then further jumps on either side of it.
 
     Args:
         frames: rows of the file that are to be used.
         jumps: rows after which the sample moved, according to the monitor.
-        progress: how many jumps were checked, of at most how many.
+        progress: function that gets the number of checked jumps and the largest number of jumps.
     """
     jumps = np.array([row for row in jumps.tolist() if (frames < row).any() and (frames >= row).any()], np.int64)
     if not jumps.size:
@@ -116,9 +117,9 @@ def find_jumps(
     runs, most = [frames], jumps.size * (jumps.size + 1) // 2
     part = np.searchsorted(jumps, frames, side="right")
     steady = frames[np.bincount(part)[part] >= LEAST]  # projections between two alarms are left out of the comparison
-    real, at, n = list[int](), 0, 0
-    while at < len(runs):
-        run, clearest, best = np.intersect1d(runs[at], steady), 1.0, 0
+    real, number, n = list[int](), 0, 0
+    while number < len(runs):
+        run, clearest, best = np.intersect1d(runs[number], steady), 1.0, 0
         for row in jumps.tolist():
             if min((run < row).sum(), (run >= row).sum()) >= LEAST:
                 n += 1
@@ -127,18 +128,18 @@ def find_jumps(
                     clearest, best = clear, row
         if best:
             real.append(best)
-            runs[at : at + 1] = [runs[at][runs[at] < best], runs[at][runs[at] >= best]]
+            runs[number : number + 1] = [runs[number][runs[number] < best], runs[number][runs[number] >= best]]
         else:
-            at += 1
+            number += 1
     kept = max(runs, key=len)
-    if real:  # it is not known to which side these belong either
+    if real:  # it is not known either to which side these projections belong
         inner = np.intersect1d(kept, steady)
         kept = kept[(kept >= inner[0]) & (kept <= inner[-1])]
     return SampleJumps(kept, _sentence_on_jumps(np.array(sorted(real), np.int64), jumps, frames.size - kept.size))
 
 
 def _sentence_on_jumps(real: I64, jumps: I64, lost: int) -> str:
-    """What was done at real jumps, and the alarms at which the projections show no jump."""
+    """A sentence that says what was done at real jumps, and at which alarms the projections show no jump."""
     text = list[str]()
     if lost:
         verb = "is" if lost == 1 else "are"
@@ -155,7 +156,9 @@ def _sentence_on_jumps(real: I64, jumps: I64, lost: int) -> str:
 
 
 def _clearness(scan: SelectedScan, axis_col: float, frames: I64, row: int) -> float:
-    """How clearly the sample was in another place from `row` on in these rows of the file; 1 is the limit."""
+    """How clearly these rows of the file show that the sample was in another place from `row` on; a jump has more than
+    1.
+    """
     from beamline.projections.correction import line_integrals_of
     from recon.base.masks import areas
     from recon.voxels.displacement import Displacement, judge
@@ -172,7 +175,9 @@ def _clearness(scan: SelectedScan, axis_col: float, frames: I64, row: int) -> fl
 
 
 def _band(scan: SelectedScan) -> SelectedScan:
-    """The scan with binned pixels, and rows around the middle of those that are used, also beyond them."""
+    """The scan with binned pixels, and with rows around the middle of the rows used; these may extend beyond the rows
+    used.
+    """
     source, selection = scan.source, scan.selection
     width, height = source.shape[1] // selection.binning, source.shape[0]
     binning = selection.binning * max(1, math.ceil(width / _COLS))
@@ -183,7 +188,9 @@ def _band(scan: SelectedScan) -> SelectedScan:
 
 
 def _search_memory(scan: SelectedScan) -> int:
-    """Bytes that `find_jumps` needs at most; 0 if the flags in the file name no jump, and none are made."""
+    """Largest memory in bytes that `find_jumps` needs. 0 if the flags in the file name no jump and the monitor does not
+    check the frames.
+    """
     from beamline.projections.correction import at_once_memory
     from recon.voxels.displacement import SWEEPS
     from recon.voxels.methods import OsSirtTv

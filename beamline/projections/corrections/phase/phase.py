@@ -28,7 +28,7 @@ _NO_FILTER = (
 
 
 def _material(text: str) -> str | None:
-    """The part after `paganin:`, or "auto"; None for "none"."""
+    """Parse the option: the part after `paganin:`, or "auto"; None for "none"."""
     way, _, material = text.partition(":")
     if text not in ("none", _AUTO) and (way != "paganin" or not material):
         raise ValueError(f"{text!r} is unknown; expected auto, none, paganin:RATIO (delta/beta) or paganin:MATERIAL")
@@ -36,7 +36,7 @@ def _material(text: str) -> str | None:
 
 
 def _unsharp(text: str) -> tuple[float, float]:
-    """`sigma:weight`."""
+    """Parse the option `sigma:weight`."""
     try:
         sigma, weight = (float(part) for part in text.split(":"))
     except ValueError:
@@ -53,12 +53,12 @@ class Phase:
     Attributes:
         material: the ratio of delta to beta, or a material, as the user gave it; "auto": the filter is chosen from
             the projections if the outer edges of the sample overshoot; None: no phase retrieval.
-        distance_mm: from the sample to the detector; None: the file's value.
-        energy_kev: None: the file's value.
+        distance_mm: distance from the sample to the detector; None: the value in the file.
+        energy_kev: photon energy; None: the value in the file.
         unsharp: (sigma in pixels as they are used, weight), see `recon.features.phase.Paganin`; None: none.
-        length: of the filter found from the projections, in pixels as they are used; None: none found, or not
-            searched for.
-        explanation: what the projections show; empty: nothing certain.
+        length: length of the filter that was found from the projections, in pixels as they are used; None: no filter
+            was found, or none was searched for.
+        explanation: what the projections show; empty: they show nothing certain.
     """
 
     name: ClassVar[str] = "phase"
@@ -129,8 +129,8 @@ class Phase:
         return StepMemory((7 if self.unsharp is None else 9) * part.view_bytes(paganin.reach), search)
 
     def estimated(self, scan: SelectedScan, views: Projections, geometry: Geometry) -> Phase | None:
-        """This step with the filter that these projections show; None if the user stated the filter, or if nothing
-        is certain.
+        """This step with the filter that these projections show. None if the user stated the filter, or if the
+        projections show nothing certain.
         """
         from recon.features.phase import LEAST_DROP, length_by_held_out_views
         from recon.prep.overshoot import Overshoot
@@ -176,7 +176,8 @@ class Phase:
         """The phase filter for pixels of the selection, and a sentence about it.
 
         Raises:
-            ConfigError: distance, energy or pixel size are unknown, or give a filter that is wider than the frame.
+            ConfigError: the distance, the energy or the pixel size is unknown, or the resulting filter is wider than
+                the frame.
         """
         from recon.features.phase import Paganin, length_of
 
@@ -220,8 +221,8 @@ class Phase:
 
 
 def _stated(source: ScanSource) -> float | None:
-    """mm from the sample to the detector according to the file. 0 counts as unknown, because programs write it if
-    nobody measured the distance.
+    """mm from the sample to the detector according to the file. 0 counts as unknown, because programs write 0 if nobody
+    measured the distance.
     """
     stated = source.attributes.get("distance_mm")
     return stated if isinstance(stated, float) and stated > 0 else None

@@ -22,7 +22,7 @@ class Rings:
     """Removal of stripes from line integrals.
 
     Attributes:
-        way: see `recon.features.rings.remove_rings_in_place`.
+        way: how stripes are removed, see `recon.features.rings.remove_rings_in_place`.
     """
 
     name: ClassVar[str] = "rings"

@@ -13,24 +13,29 @@ from beamline.core.text import are_a_count
 
 _NUMBER = re.compile(
     r"(?P<word>(?<![a-z])(?:angle|theta|ang|deg)(?:[ _=(]|-(?=[-+\u2212]))?)?"
-    r"(?P<mark>(?:minus|plus|neg|pos)[ _]?|[-+\u2013\u2212mnp])?"  # a hyphen, an en dash, a minus
+    # the characters are a hyphen, an en dash and a minus sign
+    r"(?P<mark>(?:minus|plus|neg|pos)[ _]?|[-+\u2013\u2212mnp])?"
     r"(?P<value>(?P<whole>\d+)(?:[.,p](?P<part>\d+))?(?:e[-+]\d+)?)"
     r"(?P<unit>[ _]?(?:deg|°|tilt))?",
     re.IGNORECASE,
 )
 _MINUS = re.compile(r"minus|neg|[-\u2013\u2212mn]", re.IGNORECASE)
 _THOUSANDTHS = re.compile(r"_(?P<mark>)(?P<value>(?P<whole>\d{3})_(?P<part>\d{3}))(?=_\d+$)")
-_FOLLOWING = re.compile(r"[-_ ]?(\d{1,4})(?!\d)")  # more digits are of a date or a time
+_FOLLOWING = re.compile(r"[-_ ]?(\d{1,4})(?!\d)")  # a number with more digits is a date or a time
 _PRECEDING = re.compile(r"(?<!\d)(\d{1,4})[-_ ]?$")
-_LEAST_SPAN = 90.0  # degrees; numbers of tiles or of a time of day do not go so far from projection to projection
-_FARTHEST = 3600.0  # degrees
-_TURN = 360.0  # degrees; a number with a sign but no word goes no further as an angle
-_EVEN, _ALIKE = 0.8, 0.3  # of the steps are alike, to so much of one: some images may be lost, angles are rounded
-_DISTINCT = 0.97  # of the angles: lost signs leave two of each; a scan may repeat some projections at its end
+_LEAST_SPAN = 90.0  # degrees; tile numbers or times of day cover a smaller range
+_FARTHEST = 3600.0  # degrees; no scan rotates farther
+_TURN = 360.0  # degrees; largest angle written as a number with a sign but without a word
+# least share of steps that are alike, and how far these may differ from the typical step, because images may be missing
+# and angles are rounded
+_EVEN, _ALIKE = 0.8, 0.3
+# least share of angles that are different: if signs are lost, each angle occurs twice; a scan may repeat some
+# projections at its end
+_DISTINCT = 0.97
 
 
 class NamedAngles(NamedTuple):
-    """The angles in the names of a series.
+    """The angles in the file names of a series.
 
     Attributes:
         plain: the names without the angles.
@@ -44,11 +49,13 @@ class NamedAngles(NamedTuple):
 
 
 def angles_in(names: Sequence[str]) -> NamedAngles:
-    """Angles as a number beside `angle`, `theta`, `ang` or `deg`, or before `tilt`; as the one number that has a minus
-    in some names and none in others; or as three digits of degrees and three of thousandths before the number of the
-    frame (MARS and VENUS of ORNL: sample_012_500_0003.tiff).
+    """Find the angles in file names. An angle is written in one of three ways. (1) A number next to `angle`, `theta`,
+    `ang` or `deg`, or before `tilt`. (2) The only number that has a minus in some names and not in others. (3) Three
+    digits of degrees and three digits of thousandths before the number of the frame (MARS and VENUS of ORNL:
+    sample_012_500_0003.tiff).
 
-    Decimals follow a point, a comma or p. n, m, neg and minus mean a negative sign, like a hyphen.
+    Decimals follow a point, a comma or the letter p. The texts n, m, neg and minus mean a negative sign, as a hyphen
+    does.
     """
     stems = [name.rpartition("/")[2].rpartition(".")[0] for name in names]
     numbers = [[*_NUMBER.finditer(stem)] for stem in stems]
@@ -68,7 +75,9 @@ def angles_in(names: Sequence[str]) -> NamedAngles:
 
 
 def _chosen(stems: list[str], numbers: list[list[re.Match[str]]]) -> tuple[list[re.Match[str]], bool]:
-    """The number in each name that may be its angle (fewer if some names have none), and whether a word marks it."""
+    """The number in each name that may be an angle, and whether a word marks it. Names without such a number are left
+    out.
+    """
     worded = [[number for number in row if number["word"] or number["unit"]] for row in numbers]
     if any(worded):
         return [row[0] for row in worded if len(row) == 1], True
@@ -78,13 +87,13 @@ def _chosen(stems: list[str], numbers: list[list[re.Match[str]]]) -> tuple[list[
 def _doubt_of_series(
     chosen: list[re.Match[str]], distinct: NDArray[np.float64], doubt: str, *, words: bool, another: bool
 ) -> str:
-    """Why the numbers of a series may not be angles; "" if they are.
+    """The reason why the numbers of a series may not be angles; "" if they certainly are.
 
     Args:
-        distinct: degrees, ascending.
-        doubt: about their signs and decimals.
-        words: a word stands next to them.
-        another: another number differs from name to name, and does not count images.
+        distinct: the different angles in degrees, ascending.
+        doubt: what is unclear about signs and decimals.
+        words: True if a word for angles stands next to the numbers.
+        another: True if another number differs from name to name and does not count images.
     """
     counted = are_a_count([each["value"] for each in chosen]) and (another or len(chosen[0]["value"]) > 3)
     uneven = chosen[0].re is _NUMBER and (np.abs(distinct).max() > _TURN or not _in_even_steps(distinct))
@@ -106,7 +115,9 @@ def _without(name: str, angle: re.Match[str]) -> str:
 
 
 def _with_signs(numbers: list[list[re.Match[str]]]) -> list[re.Match[str]]:
-    """The one number that has a minus in some names and none in others; empty if there are none or several."""
+    """The only number that has a minus in some names and not in others; empty if there is no such number, or
+    several.
+    """
     alike = len({len(row) for row in numbers}) == 1
     columns = [[*column] for column in zip(*numbers, strict=True)] if alike else []
     signed = [column for column in columns if 0 < sum(map(_is_minus, column)) < len(column)]
@@ -118,7 +129,7 @@ def _is_minus(number: re.Match[str]) -> bool:
 
 
 def _read(chosen: list[re.Match[str]]) -> tuple[NDArray[np.float64], str]:
-    """Degrees, and why they may be different; "" if they are certain."""
+    """The angles in degrees, and the reason why they may be read in another way; "" if they are certain."""
     degrees = np.array([float(re.sub("[,p_]", ".", each["value"].lower())) for each in chosen])
     before = [each.string[: each.start("mark" if each["mark"] else "value")] for each in chosen]
     minus = np.array([*map(_is_minus, chosen)])
@@ -140,8 +151,9 @@ def _mark(number: re.Match[str]) -> str:
 
 
 def _separates(chosen: list[re.Match[str]], before: list[str], *, zero: bool) -> bool:
-    """True if the mark before all numbers is a separator, as between a word and numbers of one width from 0 on, because
-    there is no sign before 0. A hyphen in only some names is a sign.
+    """True if the mark before the numbers is a separator and not a sign. It is a separator if it stands before all
+    numbers, these have the same width, and one of them is 0, because 0 has no sign. A hyphen in only some names is a
+    sign.
     """
     wholes = [each["whole"] for each in chosen]
     padded = {len(whole) for whole in wholes} == {max(2, len(wholes[0]))}
@@ -149,7 +161,9 @@ def _separates(chosen: list[re.Match[str]], before: list[str], *, zero: bool) ->
 
 
 def _doubt_of_decimals(chosen: list[re.Match[str]], before: list[str]) -> str:
-    """Why the digits next to a point, or next to the number, may or may not be decimals; "" if that is clear."""
+    """The reason why it is unclear whether the digits after a point, or next to the number, are decimals; "" if it is
+    clear.
+    """
     parts, wholes = [each["part"] or "" for each in chosen], [each["whole"] for each in chosen]
     if are_a_count(parts) or (are_a_count(wholes) and len({*parts}) > 1):
         return "the digits before or after the decimal mark only number the images"

@@ -18,24 +18,26 @@ from beamline.storage.readers.images.image_angles import NamedAngles, angles_in
 from drivers.base.frame import FrameKind
 
 _REFERENCE = re.compile(r"(?:^|[^a-z])(dark|flat|white|open[ _-]?beam)")
-# Of neutron imaging (open beam, dark field, dark current), and of TESCAN's XRE (io, di).
+# Words of neutron imaging (open beam, dark field, dark current) and of TESCAN's XRE (io, di).
 _SHORT = re.compile(r"(?:^|[^a-z])(ob|df|dc|io|di)(?![a-z])")
-_PLAIN = re.compile(  # words of references, and those that go with them
+_PLAIN = re.compile(  # words for darks and flats, and words that occur together with them
     r"open[ _-]?beam|dark|flat|white|ob|df|dc|fields?|images?|frames?|pre|post|before|after|s\b|current"
 )
-_AFTER = re.compile(r"after|(?<![a-z])post(?![a-z])")  # of references taken after the projections
-_DEGREES = re.compile(r"(?<!\d)(\d+)[ _-]?deg")  # of a folder
-COUNTED = 100  # range of the numbers over the count of files; above it the numbers do not count frames
-_DATE = 100_000  # from which a number next to that of the image is a date or a time, which may stay the same
+# in the names of darks and flats that were taken after the projections
+_AFTER = re.compile(r"after|(?<![a-z])post(?![a-z])")
+_DEGREES = re.compile(r"(?<!\d)(\d+)[ _-]?deg")  # in the name of a folder
+# largest ratio of the range of the numbers to the number of files; with a larger ratio the numbers do not count frames
+COUNTED = 100
+_DATE = 100_000  # a second number of at least this size is a date or a time, which may be the same in several names
 
 
 def kinds_of(path: object, names: Sequence[str]) -> dict[str, FrameKind]:
-    """The kind of each image of a scan. If there is only one series, it is the projections, whatever the sample is
-    called.
+    """The kind of each image of a scan. If there is only one series, its images are the projections, whatever their
+    names are.
 
-    Words for darks and flats (dark, flat, white, open beam; ob, df, dc as whole words) decide. If no projection would
-    remain, the name of the sample contains such a word. The projections are then the one series with another word in
-    its name, or the only series, or the largest series, if darks and flats exist without it.
+    Words for darks and flats in the names decide (dark, flat, white, open beam; ob, df, dc as whole words). If every
+    name contains such a word, the word is part of the sample's name. The projections are then the only series whose
+    name contains another word, or the only series, or the largest series if the other series contain darks and flats.
 
     Raises:
         DataError: no series can be recognised as the projections.
@@ -59,7 +61,7 @@ def kinds_of(path: object, names: Sequence[str]) -> dict[str, FrameKind]:
 
 
 def _sample_of(series: dict[str, list[str]], kinds: dict[str, FrameKind]) -> str | None:
-    """The one of several series, all named as references, that is the sample."""
+    """The series that shows the sample, among several series whose names all contain words for darks or flats."""
     if len(series) == 1:
         return next(iter(series))
     stems = {key: str(PurePosixPath(key).with_suffix("")).lower() for key in series}
@@ -73,7 +75,9 @@ def _sample_of(series: dict[str, list[str]], kinds: dict[str, FrameKind]) -> str
 
 
 def _kind_of(name: str) -> FrameKind:
-    """The kind of image from a file's name relative to the scan's folder; the name has precedence over folders."""
+    """The kind of an image from its path relative to the scan's folder. The file name has precedence over the names of
+    folders.
+    """
     for words in (_REFERENCE, _SHORT):
         for part in reversed(name.lower().split("/")):
             match = words.search(part)
@@ -93,19 +97,19 @@ def _without_common_folder(names: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class NamedImages:
-    """The images of a scan ordered by their names: darks, flats, then the projections by number, and after them the
-    darks and flats that are named so (after, post), and images that are not used.
+    """The images of a scan in the order of their names: darks, flats, and the projections by number. Then follow the
+    darks and flats that were taken afterwards (after or post in the name), and images that are not used.
 
     Attributes:
-        names: of the files.
+        names: names of the files.
         kinds: int32 [file], values of FrameKind.
-        angles: float64 [file] radians, NaN if the name states no angle.
+        angles: float64 [file] radians; NaN if the name states no angle.
         numbers: int64 [file], -1 for darks and flats whose numbers do not belong to the series; None if files are not
             numbered.
-        of_series: int64 [projection], the numbers of the series; None if the numbers do not count images.
-        plain: the names of the projections without their angles.
+        of_series: int64 [projection], number of each projection in its series; None if the numbers do not count images.
+        plain: names of the projections, without the angles.
         doubt: why the angles in the names are not used; empty if they are used or the names have none.
-        half_turn: images in a folder of their own that is named after 180 degrees, which are invalid frames.
+        half_turn: images in a separate folder whose name means 180 degrees; they are invalid frames.
     """
 
     names: list[str]
@@ -135,7 +139,7 @@ def in_order(path: object, images: Sequence[str], *, one_series: bool = False) -
     """The images of a scan, in order.
 
     Args:
-        one_series: all of them are one numbered series, whatever the names say of kinds.
+        one_series: True if all images are one numbered series, whatever kinds the names state.
 
     Raises:
         DataError: no series can be recognised as the projections, or there are several.
@@ -166,7 +170,7 @@ def in_order(path: object, images: Sequence[str], *, one_series: bool = False) -
 
 
 def _half_a_turn_on(series: list[str]) -> list[str]:
-    """Images in the one folder that is named after an angle of 180 or 360 degrees, next to all others."""
+    """The images in the only folder whose name means 180 or 360 degrees, if it lies next to all other images."""
     stated = {name: _DEGREES.search(name.lower().rpartition("/")[0]) for name in series}
     named = [name for name, match in stated.items() if match and match[1] in ("180", "360")]
     return named if 2 * len(named) < len(series) and len(named) == sum(map(bool, stated.values())) else []
@@ -176,10 +180,10 @@ def _places(path: object, stated: NamedAngles, images: Sequence[str], *, one_ser
     """The number of each image of a series, from its name without an angle. Raises DataError if there are several
     series.
 
-    Series with their own counts follow one another, for example if their names state their kinds.
+    If series are numbered separately, for example because their names state their kinds, they follow one another.
 
     Args:
-        images: of the scan, also those of other kinds.
+        images: all images of the scan, including those of other kinds.
     """
     plain = stated.plain
     counted, several = _numbers(plain), len({_template(name, stated.doubt) for name in plain}) > 1
@@ -196,7 +200,7 @@ def _places(path: object, stated: NamedAngles, images: Sequence[str], *, one_ser
 
 
 def _rank(name: str) -> int:
-    """Place of a kind of frames in a scan: darks, flats, projections, then darks and flats taken afterwards."""
+    """Sort key of an image by its kind: darks, flats, projections, then darks and flats taken afterwards."""
     kind = _kind_of(name)
     return (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION).index(kind) + 3 * (
         kind in _REFERENCES and _AFTER.search(name.lower()) is not None
@@ -204,15 +208,17 @@ def _rank(name: str) -> int:
 
 
 def _template(name: str, doubt: str = "") -> str:
-    """A name without its numbers; if it is unclear whether a mark is a sign, without the mark."""
+    """A name without its numbers. If it is unclear whether marks before numbers are signs, the marks are removed,
+    too.
+    """
     return re.sub(r"[-+_\d]+" if doubt else r"\d+", "", name)
 
 
 def _numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
     """The number of each image, at any place in the name; None if no number differs from name to name.
 
-    If several numbers differ, the one that counts most consecutively; others, such as a date, may only vary together
-    with it.
+    If several numbers differ from name to name, the number whose values are closest to consecutive is used. Any other
+    number, such as a date, may only change together with it.
     """
     numbers = np.zeros(len(names), np.int64)
     of_template: dict[str, list[int]] = {}
@@ -227,7 +233,7 @@ def _numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
 
 
 def _counting(names: list[str]) -> list[int] | None:
-    """The number that counts names of one template most closely."""
+    """The number whose values are closest to consecutive, in names that differ only in numbers."""
     digits = [re.findall(r"\d+", name) for name in names]
     columns = [[int(each[-18:]) for each in column] for column in zip(*digits, strict=False)]
     if not columns or len({len(each) for each in digits}) > 1:
@@ -239,25 +245,25 @@ def _counting(names: list[str]) -> list[int] | None:
         decimals = [re.findall(r"\d+[.,]\d+", name) for name in names]
         values = [float(each[0].replace(",", ".")) for each in decimals if len(each) == 1]
         ranks = np.unique(values, return_inverse=True)[1].tolist()
-        return ranks if len({*ranks}) == len(names) else None  # such as angles: they tell the order alone
+        return ranks if len({*ranks}) == len(names) else None  # for example angles: they state only the order
     return columns[min(counting, key=lambda n: (max(columns[n]) - min(columns[n]), columns[n], -n))]
 
 
 def _frame_numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
-    """The numbers of images that count frames, not dates."""
+    """The numbers of the images if they count frames; None if they are, for example, dates."""
     numbers = _numbers(names)
     counts = numbers is not None and np.ptp(numbers) <= COUNTED * np.unique(numbers).size == COUNTED * numbers.size
     return numbers if counts else None
 
 
 def places_of(names: Sequence[str]) -> str:
-    """Which places in a scan the images of each name have, such as "dark_#.tif 0:5, s_#.tif 5:95"."""
+    """The rows that the images of each series have in the scan, such as "dark_#.tif 0:5, s_#.tif 5:95"."""
     of_names = groupby(range(len(names)), lambda place: re.sub(r"\d+", "#", names[place]))
     runs = [f"{name} {places[0]}:{places[-1] + 1}" for name, some in of_names for places in [[*some]]]
     return ", ".join(runs[:_LISTED]) + ", ..." * (len(runs) > _LISTED)
 
 
-_LISTED = 6  # series that a sentence names
+_LISTED = 6  # largest number of series that a sentence lists
 
 
 def _several_series(path: object, names: Sequence[str], images: Sequence[str]) -> str:
@@ -266,7 +272,7 @@ def _several_series(path: object, names: Sequence[str], images: Sequence[str]) -
         templates = [re.sub(r"\d+(?=\D*$)", "", name) for name in names]
     numbers = ", ".join(f"{templates.count(kind)} of {kind!r}" for kind in sorted(set(templates))[:_LISTED])
     places = ""
-    with suppress(DataError):  # no order where the same names are several series again
+    with suppress(DataError):  # there is no order if images with the same names are again in several series
         if images:
             places = f", counted from 0 in this order: {places_of(in_order(path, images, one_series=True).names)}"
     return (

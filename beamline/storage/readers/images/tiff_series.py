@@ -59,17 +59,17 @@ from beamline.storage.writers.rows import ScanEnding
 from drivers.base.frame import FrameKind
 
 MOST_FILES = 100_000
-LARGEST_IMAGE = 2**30  # bytes of an image: 16,000 x 16,000 pixels of 4 bytes
-_LOOKED, _REFERENCES = 2**30, 1000  # bytes, and number, of darks and flats that are read to tell their type
-_MOST_NUMBERS = 2**20  # from the first number of a series to its last
-_TRIED = 3  # first images of a series, of which one must be readable, as the others are then
-_FEW_STACKS = 20  # files of a folder that may be stacks; all are open at once
+LARGEST_IMAGE = 2**30  # bytes of an image: 16 000 x 16 000 pixels of 4 bytes
+_LOOKED, _REFERENCES = 2**30, 1000  # most bytes, and most darks and flats, that are read to find out their type
+_MOST_NUMBERS = 2**20  # largest difference between the last and the first number of a series
+_TRIED = 3  # one of this many first images of a series must be readable; then the others are assumed to be readable
+_FEW_STACKS = 20  # most files of a folder that may be stacks, because all are open at the same time
 _SCALES, _PICTURE = "scaleoffset.json", ".png"
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$|(?:^|/)(angles?|thetas?)\.npy$")
 
 
 class _StacksError(DataError):
-    """A file holds more than an image."""
+    """A file contains more than one image."""
 
 
 class TiffSeriesSource(ScanSource):
@@ -82,8 +82,8 @@ class TiffSeriesSource(ScanSource):
         """Open.
 
         Args:
-            one_series: all images are one numbered series, whatever the names say of kinds.
-            listed: names of the images, all of them projections; None: those that lie in the folder.
+            one_series: True if all images are one numbered series, whatever kinds the names state.
+            listed: names of the images, which are all projections; None: all images in the folder.
         """
         self.path = path
         self._zip = _open_zip(path) if path.is_file() else None
@@ -96,7 +96,8 @@ class TiffSeriesSource(ScanSource):
             self.names, self.in_order = images.names, len(images.series) == len(images.names)
             self.table = FrameTable.of(images.kinds, images.angles, numbers=images.numbers)
             references, series = images.references, images.series
-            with suppress(UnreadableError, *UNREADABLE), self._tiff(series[0]) as tif:  # damage is told below
+            # damage is reported further below
+            with suppress(UnreadableError, *UNREADABLE), self._tiff(series[0]) as tif:
                 refuse_volume(path, tif)
                 self.not_used, self.untyped = stated(path, tif), is_untyped(tif)
             some = references[:: len(references) // _REFERENCES + 1]
@@ -118,7 +119,9 @@ class TiffSeriesSource(ScanSource):
 
     @property
     def angle_text(self) -> tuple[str, str] | None:
-        """Name and content of the one file named after angles, or None. Raises DataError if it is too large."""
+        """Name and content of the only file whose name means angles; None if there is no such file. Raises DataError if
+        the file is too large.
+        """
         return (self._texts[0], self._text(self._texts[0])) if len(self._texts) == 1 else None
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
@@ -147,7 +150,8 @@ class TiffSeriesSource(ScanSource):
             return [name for name in packed if not is_hidden(name)]
         names, places = list[Path](), set[str]()
         for folder, inner, files in os.walk(self.path, followlinks=True):
-            inner[:] = [] if (place := os.path.realpath(folder)) in places else inner  # a link to one that was seen
+            # a link to a folder that was already visited
+            inner[:] = [] if (place := os.path.realpath(folder)) in places else inner
             names += [] if place in places else [Path(folder, name) for name in files]
             places.add(place)
             _refuse_more(self.path, len(names) + len(places))
@@ -164,7 +168,7 @@ class TiffSeriesSource(ScanSource):
         return (self.path / name).stat().st_size if self._zip is None else self._zip.getinfo(name).file_size
 
     def _opened(self, name: str, most: int) -> IO[bytes]:
-        """A file of the series, of at most `most` bytes."""
+        """The content of a file of the series, which may have at most `most` bytes."""
         if (n := self._size(name)) > most:
             raise OSError(errno.EFBIG, f"it has {size(n)}; at most {size(most)} are allowed")
         if self._zip is not None and is_blank(n, self._zip.getinfo(name).compress_size, n):
@@ -173,7 +177,7 @@ class TiffSeriesSource(ScanSource):
 
     @contextmanager
     def _tiff(self, name: str) -> Iterator[TiffFile]:
-        """The head of an image, whose pixels are not read."""
+        """Shape and type of an image. Only the header is read, not the pixels."""
         try:
             with self._opened(name, LARGEST_IMAGE) as file, open_tiff(file) as tif:
                 yield tif
@@ -181,10 +185,10 @@ class TiffSeriesSource(ScanSource):
             raise UnreadableError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
 
     def _readable(self, names: list[str], at_least: int = 0) -> list[tuple[tuple[int, int], np.dtype[Any]]]:
-        """Shape and type of the images of these files that can be read, by their heads; DataError if they are fewer
-        than `at_least`.
+        """Shape and type of the images in these files, from their headers. Raises DataError if fewer than `at_least`
+        files can be read.
 
-        Of many bytes the first ones: to tell their type takes no more.
+        If the files have very many bytes, only the first files are read; they are enough to find out the type.
         """
         images, failed, looked = list[tuple[tuple[int, int], np.dtype[Any]]](), list[UnreadableError](), 0
         for name in names:
@@ -234,10 +238,10 @@ class TiffSeriesSource(ScanSource):
 
 
 def _text_of(name: str, content: bytes) -> str:
-    """The content of a text file, or of an .npy with a number a line."""
+    """The content of a text file. For an .npy, a text with one number per line."""
     if name.lower().endswith(".npy"):
         return "\n".join(map(str, np.ravel(DECODERS[".npy"](io.BytesIO(content))).tolist()))
-    return decoded(content, "replace")  # a comment in another alphabet; numbers are told later
+    return decoded(content, "replace")  # a comment may be in another alphabet; wrong numbers are reported later
 
 
 def _open_zip(path: Path) -> zipfile.ZipFile:
@@ -256,9 +260,9 @@ def _refuse_more(path: Path, n: int) -> None:
 
 
 def _omitted(images: NamedImages) -> tuple[tuple[int, ...], str]:
-    """The places in the scan of numbers that a series leaves out, and these numbers in words."""
+    """The rows of a scan at which the numbers of a series have gaps, and the missing numbers as text."""
     numbers = images.of_series
-    if numbers is None or np.ptp(numbers) >= _MOST_NUMBERS:  # dates and serial numbers count no images
+    if numbers is None or np.ptp(numbers) >= _MOST_NUMBERS:  # dates and serial numbers do not count images
         return (), ""
     left_out, first = sorted({*range(numbers.min(), numbers.max())} - {*numbers.tolist()}), int(numbers.min())
     before = int((images.kinds == FrameKind.PROJECTION).argmax())
@@ -271,7 +275,7 @@ _AXES = "volume[z, y, x] is vol_gt.transpose(2, 0, 1)[::-1, ::-1]; lengths in mm
 
 
 def _scene_of(path: Path) -> Path | None:
-    """The folder of a scene, by itself or by its file; None for another path."""
+    """The folder of a scene, from the folder itself or its file meta_data.json; None for any other path."""
     folder = path.parent if path.name == _META else path
     file = folder / _META
     return folder if file.is_file() and '"proj_train"' in text_in(file) else None
@@ -280,12 +284,12 @@ def _scene_of(path: Path) -> Path | None:
 def _open_scene(folder: Path) -> ScanSource:
     """The scan in the folder of a scene of R²-Gaussian (Zha et al. 2024, NeurIPS, github.com/Ruyi-Zha/r2_gaussian).
 
-    Its scanner has no unit of length: one of its units counts as 1 mm, so that densities are those of its volume.
-    Projections and angles are taken as they stand. There the first row of a projection is the highest z, and the source
-    stands at (DSO cos θ, DSO sin θ, 0): `_AXES` follows.
+    The scene states no unit of length. One of its units counts as 1 mm, so that densities are those of the scene's
+    volume. Projections and angles are used unchanged. In a scene, the first row of a projection has the highest z, and
+    the source is at (DSO cos θ, DSO sin θ, 0). `_AXES` states what follows for the axes.
 
     Raises:
-        DataError: projections are not there, or it is no cone or parallel beam.
+        DataError: projections are missing, or the beam is neither a cone nor parallel.
     """
     meta: dict[str, Any] = json.loads(text_in(folder / _META))
     scanner, angles = meta["scanner"], {str(view["file_path"]): float(view["angle"]) for view in meta["proj_train"]}
@@ -338,7 +342,9 @@ def _open(path: Path, opening: Opening) -> ScanSource:
 
 
 def _of_stacks(path: Path, images: NamedImages) -> ScanSource:
-    """The scan of a folder whose files hold stacks of images, of kinds that their names tell."""
+    """The scan in a folder whose files contain stacks of images. The names of the files state the kinds of the
+    frames.
+    """
     tiff = images.names[0].lower().endswith(SUFFIXES)
     with ExitStack() as opened:
         files = [
@@ -361,8 +367,10 @@ def _of_stacks(path: Path, images: NamedImages) -> ScanSource:
 
 
 def _with_references_beside(source: TiffSeriesSource) -> TiffSeriesSource:
-    """The scan of the folder above, where its projections are those of this one, and others are darks or flats."""
-    with suppress(DataError, OSError):  # what lies there is only looked at, and may be no scan
+    """The scan of the folder above this one, if this folder contains its projections, and other folders contain darks
+    or flats.
+    """
+    with suppress(DataError, OSError):  # the folder above is only a suggestion, and may not contain a scan
         above = TiffSeriesSource(source.path.absolute().parent)
         views = [Path(above.names[i]).parts[0] for i in above.table.views]
         beside = sorted({Path(name).parts[0] for name in above.names} - {*views})
@@ -373,7 +381,9 @@ def _with_references_beside(source: TiffSeriesSource) -> TiffSeriesSource:
 
 
 def _with_values(source: TiffSeriesSource) -> ScanSource:
-    """The values of a series that CIL packed, by the scale and the offset in the file that it writes beside images."""
+    """A series that CIL packed, with its values restored from the scale and the offset in the file that CIL writes next
+    to the images.
+    """
     attributes = json.loads(source.packing) if source.packing else {}
     values = (
         packing(attributes, source.dtype, f"{_SCALES} in {source.path}", by_cil=True)

@@ -63,18 +63,19 @@ class TiffStackSource(ScanSource):
         self.not_used += offered(self)
 
     def _look(self) -> int:
-        """Shape, type and place of the frames, and how many there are."""
+        """Find shape, type and position of the frames. Returns the number of frames."""
         refuse_volume(self.path, self._tif)
         refuse_packed(self._tif)
         require_possible(self._tif)
         series, *others = parts = images_of(self._tif)
-        if len(series.shape) not in (2, 3) or others or "S" in series.axes:  # samples of a colour
+        # the letter S stands for the samples of a colour image
+        if len(series.shape) not in (2, 3) or others or "S" in series.axes:
             shapes = ", ".join(f"{part.shape} along {part.axes}" for part in parts[:6])
             shapes += f", ... ({len(parts)} in all)" if len(parts) > 6 else ""
             raise DataError(f"{self.path} contains {shapes}; expected one stack of grey images [page, row, col].")
         self.not_used, self.untyped = stated(self.path, self._tif), is_untyped(self._tif)
         self._stored, self.dtype, self._orientation = series.shape[-2:], np.dtype(series.dtype), orientation(self._tif)
-        # Uncompressed stacks are one run of bytes: any frame, or some of its rows, is where arithmetic says.
+        # An uncompressed stack is one block of bytes, so the position of any frame and row can be computed.
         self._pages, self._offset = series.pages, series.dataoffset
         self.shape = self._stored[::-1] if self._orientation >= 5 else self._stored
         require_real(self.dtype, str(self.path))
@@ -95,7 +96,7 @@ class TiffStackSource(ScanSource):
         return out
 
     def _page(self, page: int) -> NDArray[Any]:
-        """A page as it is stored."""
+        """A page with the orientation in which it is stored."""
         if self._offset is None:
             image = self._tif.pages.get(self._pages[page].index, aspage=True, cache=False).asarray()
             if (image.shape, image.dtype) != (self._stored, self.dtype):
@@ -108,7 +109,7 @@ class TiffStackSource(ScanSource):
         return whole
 
     def _fill(self, out: NDArray[Any], page: int, first: int) -> None:
-        """Fill `out` with the rows of a page from the first on."""
+        """Fill `out` with rows of a page, beginning at row `first`."""
         self._tif.filehandle.seek(self._offset + (page * self._stored[0] + first) * self._stored[1] * out.itemsize)
         n = self._tif.filehandle.readinto(out)
         if n != out.nbytes:

@@ -1,8 +1,9 @@
-"""Scans of Zeiss (Xradia) microscopes: .txrm, an OLE compound file with a stream for each image and each list.
+"""Reads scans of Zeiss (Xradia) microscopes: .txrm, an OLE compound file with a stream for each image and each list.
 
-Stream names, types and units after two public readers: dxchange (De Carlo et al. 2014, J. Synchrotron Rad. 21, 1224;
-with it CIL's ZEISSDataReader) and txrm2tiff (Diamond Light Source). Both divide projections by the one reference
-without a dark, which the instrument has subtracted. Images are as they are stored.
+Stream names, types and units follow two public readers: dxchange (De Carlo et al. 2014, J. Synchrotron Rad. 21, 1224;
+also used by CIL's ZEISSDataReader) and txrm2tiff (Diamond Light Source). Both readers divide projections by the single
+reference image and subtract no dark, because the instrument has already subtracted it. Images keep the stored
+orientation.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ FORMATS = {"txrm": __name__}
 _SIGNATURE = bytes.fromhex("d0cf11e0a1b11ae1")
 _TYPES: dict[int, np.dtype[Any]] = {5: np.dtype("<u2"), 10: np.dtype("<f4")}
 _PER_STORAGE = 100  # images
-_CONE = 1  # of ImageInfo/XrayGeometry
-_ACQUIRED = 0  # of ImageInfo/AcquisitionMode; else a volume
+_CONE = 1  # codes of ImageInfo/XrayGeometry
+_ACQUIRED = 0  # codes of ImageInfo/AcquisitionMode; all other codes are volumes
 
 
 class TxrmFile:
-    """The streams of a .txrm file. Used within hdf5.readable, which converts its errors to a DataError."""
+    """The streams of a .txrm file. Use it within hdf5.readable, which converts errors to a DataError."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -46,7 +47,7 @@ class TxrmFile:
         self._ole = olefile.OleFileIO(path)
 
     def bytes_of(self, name: str) -> bytes:
-        """The content of a stream; EOFError if there is none."""
+        """The content of a stream. Raises EOFError if the stream does not exist."""
         if not self._ole.exists(name):
             raise EOFError(f"the stream {name} is missing")
         return bytes(self._ole.openstream(name).read())
@@ -64,7 +65,7 @@ class TxrmFile:
         return None if numbers is None else int(numbers[0])
 
     def image(self, name: str, shape: tuple[int, int], dtype: np.dtype[Any]) -> NDArray[Any]:
-        """An image [row, col]; ValueError if the stream has another size."""
+        """An image [row, col]. Raises ValueError if the stream has another size."""
         return np.frombuffer(self.bytes_of(name), dtype).reshape(shape)
 
     def close(self) -> None:
@@ -72,7 +73,7 @@ class TxrmFile:
 
 
 class _Views:
-    """The projections [view, row, col], each read when it is asked for."""
+    """The projections [view, row, col]. Each projection is read when it is needed."""
 
     ndim = 3
 
@@ -87,7 +88,8 @@ class _Views:
         wanted = range(len(self))[views]
         out = np.empty((len(wanted), len(range(self.shape[1])[rows]), self.shape[2]), self.dtype)
         with hdf5.readable(self._path):
-            for part, i in zip(out, wanted, strict=True):  # a whole image at a time: its file has no smaller pieces
+            # reads a whole image at a time, because the file has no smaller pieces
+            for part, i in zip(out, wanted, strict=True):
                 name = f"ImageData{i // _PER_STORAGE + 1}/Image{i + 1}"
                 part[:] = self._file.image(name, self.shape[1:], self.dtype)[rows]
         return out
@@ -96,7 +98,7 @@ class _Views:
 def open_txrm(path: Path, *, own_angles: bool = True) -> StacksSource:
     """Open a .txrm file. `own_angles` False: the caller supplies the angles, so the file may lack them.
 
-    DataError if olefile is not installed, or the file holds a volume, a mosaic, or what cannot be read.
+    Raises DataError if olefile is not installed, if the file contains a volume or a mosaic, or if it is unreadable.
     """
     with hdf5.readable(path):
         file = TxrmFile(path)
@@ -105,8 +107,8 @@ def open_txrm(path: Path, *, own_angles: bool = True) -> StacksSource:
 
 
 def _header(path: Path, file: TxrmFile) -> tuple[tuple[int, int, int], np.dtype[Any], int]:
-    """Images, rows and columns, the type of a pixel, and how many images were planned. Raises DataError if they are
-    impossible.
+    """Number of images, rows and columns, the type of a pixel, and the planned number of images. Raises DataError if
+    these are impossible.
     """
     info = {name: file.number(f"ImageInfo/{name}") for name in ("ImageHeight", "ImageWidth", "NoOfImages", "DataType")}
     lost = [name for name, value in info.items() if value is None]
@@ -133,7 +135,7 @@ def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
     )
     if reference is not None:
         flat = file.image("ReferenceData/Image", (rows, cols), reference)[None]
-        dark = np.zeros_like(flat)  # subtracted by the instrument
+        dark = np.zeros_like(flat)  # the instrument has subtracted the darks
         stacks = [
             FrameStack(FrameKind.DARK, "dark", dark),
             FrameStack(FrameKind.FLAT, "ReferenceData/Image", flat),
@@ -160,7 +162,8 @@ def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
 def _refuse(path: Path, file: TxrmFile) -> None:
     if file.number("ImageInfo/AcquisitionMode") not in (None, _ACQUIRED):
         raise DataError(f"Give the .txrm file: {path} is a volume (.txm) or a single image, not a scan.")
-    if any(file.number(f"ImageInfo/{name}") for name in ("MosiacColumns", "MosiacRows")):  # as the streams are spelt
+    # sic: the streams have this spelling
+    if any(file.number(f"ImageInfo/{name}") for name in ("MosiacColumns", "MosiacRows")):
         raise DataError(
             f"{path} is a mosaic; expected projections of one field of view each. Stitch it with the "
             "microscope's program."
@@ -170,8 +173,9 @@ def _refuse(path: Path, file: TxrmFile) -> None:
 def _shifts(path: Path, file: TxrmFile, n: int) -> NDArray[np.float64]:
     """Displacement of each image, [view, 2] pixels (col, row).
 
-    The file holds the shift that brings each one back (drift, runout, encoder; txrm2tiff and MBIRTorch move images by
-    it). In a real file the displacement of each projection against the one before has the opposite sign, too.
+    The file contains the shift that corrects each image (for drift, runout and encoder); txrm2tiff and MBIRTorch move
+    images by this shift. In a real file, the displacement between successive projections has the opposite sign, which
+    confirms this.
     """
     shifts_by_axis = [file.numbers(f"Alignment/{axis}-Shifts", "<f4", n) for axis in "XY"]
     shifts = np.stack([np.zeros(n) if each is None else -each.astype(np.float64) for each in shifts_by_axis], axis=1)
@@ -181,7 +185,7 @@ def _shifts(path: Path, file: TxrmFile, n: int) -> NDArray[np.float64]:
 
 
 def _set_exposures(source: StacksSource, file: TxrmFile, n: int) -> None:
-    """Seconds of the projections and of the reference, which may have its own."""
+    """Exposure of the projections in s, and of the reference, which may be different."""
     views = file.numbers("ImageInfo/ExpTimes", "<f4", n)
     source.table.exposures[-n:] = np.nan if views is None else np.where(views > 0, views, np.nan)
     for name in ("ReferenceData/ImageInfo/ExpTimes", "ReferenceData/ImageInfo/ExpTime", "ReferenceData/ExpTime"):
@@ -192,7 +196,7 @@ def _set_exposures(source: StacksSource, file: TxrmFile, n: int) -> None:
 
 
 def _set_scale(source: StacksSource, file: TxrmFile) -> None:
-    """Pixel size, which the file states at the sample (µm), and the distances of a cone (mm, of either sign)."""
+    """Pixel size at the sample (stored in µm), and the distances of a cone beam (stored in mm, with either sign)."""
     pixel, near, far = (
         None if lengths is None else abs(float(lengths[0]))
         for lengths in (
@@ -208,7 +212,7 @@ def _set_scale(source: StacksSource, file: TxrmFile) -> None:
 
 
 def _facts(file: TxrmFile) -> dict[str, str | float | int]:
-    """What else the file says, in its own units."""
+    """Other facts in the file, in the units of the file."""
     facts: dict[str, str | float | int] = {}
     for name in ("Energy", "Current", "OpticalMagnification", "CamPixelSize", "Temperature"):
         values = file.numbers(f"ImageInfo/{name}", "<f4")

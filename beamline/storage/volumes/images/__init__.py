@@ -1,4 +1,4 @@
-"""Volumes as TIFF: one file with a page per slice, or a folder with a file per slice."""
+"""Volumes stored as TIFF: one file with a page per slice, or a folder with a file per slice."""
 
 from beamline.storage.volumes import FormatEntry
 

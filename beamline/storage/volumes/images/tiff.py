@@ -22,15 +22,17 @@ from beamline.storage.structure import dtype_of, shape_of
 from beamline.storage.volumes import REGISTRY
 from beamline.storage.volumes.base import Slices, facts_of, marked, record_of
 
-CLASSIC_TIFF_BYTES = 4_000_000_000  # bytes of voxels that a TIFF with offsets of 32 bits holds; more take a BigTIFF
-_UNITS = {"mm": "mm", "px": "pixel"}  # as ImageJ and OME call them
+# most bytes of voxels in a TIFF with offsets of 32 bits; larger volumes need a BigTIFF
+CLASSIC_TIFF_BYTES = 4_000_000_000
+_UNITS = {"mm": "mm", "px": "pixel"}  # names of the axes in ImageJ and OME
 
 
 @dataclass(frozen=True)
 class TiffVolume:
-    """One TIFF, an ImageJ hyperstack; from 4 GB on, the limit of that format, a BigTIFF with OME metadata.
+    """One TIFF as an ImageJ hyperstack. From 4 GB on, which is the limit of this format, it is a BigTIFF with OME
+    metadata.
 
-    Both say the edges of a voxel in x, y and z; the facts are JSON in ImageJ's `Info` or OME's `Description`.
+    Both state the edges of a voxel in x, y and z. The metadata are JSON in ImageJ's `Info` or OME's `Description`.
     """
 
     name: str = "TIFF"
@@ -41,7 +43,7 @@ class TiffVolume:
         dtype = slices.pixels.dtype
         big = int(np.prod(slices.shape, dtype=np.int64)) * dtype.itemsize >= CLASSIC_TIFF_BYTES
         facts = json_of(facts_of(record, slices.pixels) | {"shape": slices.shape})
-        ome = big or slices.shape[2] == 1  # tifffile takes a single column of ImageJ's for samples of a pixel
+        ome = big or slices.shape[2] == 1  # tifffile takes a single column of an ImageJ file for the samples of a pixel
         tags = _ome(record, facts) if ome else _imagej(record, facts)
         with tifffile.TiffWriter(path, bigtiff=big, ome=ome, imagej=not ome, byteorder="<") as tif:
             tif.write(iter(slices), shape=slices.shape, dtype=dtype, photometric="minisblack", **tags)
@@ -68,7 +70,9 @@ class TiffVolume:
 
 @dataclass(frozen=True)
 class TiffFolderVolume:
-    """A folder of `slice_00000.tif` and so on; every file has the metadata, its own number and the number of slices."""
+    """A folder with `slice_00000.tif` and so on. Every file contains the metadata, its own number and the number of
+    slices.
+    """
 
     name: str = "folder of TIFFs"
     suffixes: tuple[str, ...] = REGISTRY["tiff_folder"].suffixes
@@ -105,7 +109,7 @@ class TiffFolderVolume:
 
 @dataclass(frozen=True)
 class _Stack:
-    """A folder of slices that is sliced along z as an array is."""
+    """A folder of slices that can be sliced along z like an array."""
 
     folder: Path
     shape: tuple[int, int, int]
@@ -141,7 +145,7 @@ def facts_of_imagej(path: Path) -> dict[str, Any] | None:
 
 
 def _note(tif: tifffile.TiffFile) -> str:
-    """Where our facts stand: in ImageJ's information, OME's description, or the description of a slice."""
+    """The text that contains our metadata: ImageJ's information, OME's description, or the description of a slice."""
     if tif.is_imagej:
         return str((tif.imagej_metadata or {}).get("Info", ""))
     if tif.ome_metadata:
@@ -150,14 +154,14 @@ def _note(tif: tifffile.TiffFile) -> str:
 
 
 def _imagej(record: ReconRecord, facts: str) -> dict[str, Any]:
-    """Pixels per unit, and the pitch of slices in that unit, as ImageJ has them."""
+    """Pixels per unit, and the distance of slices in this unit, as ImageJ stores them."""
     z, _, x = record.volume.grid.spacing
     metadata = {"axes": "ZYX", "spacing": z, "unit": _UNITS[record.length_unit], "format": VOLUME, "Info": facts}
     return {"resolution": (1 / x, 1 / x), "resolutionunit": "NONE", "metadata": metadata}
 
 
 def _ome(record: ReconRecord, facts: str) -> dict[str, Any]:
-    """The edges of a voxel, as OME has them."""
+    """The edges of a voxel, as OME stores them."""
     metadata: dict[str, Any] = {"axes": "ZYX", "Description": facts}
     for axis, edge in zip("ZYX", record.volume.grid.spacing, strict=True):
         metadata |= {f"PhysicalSize{axis}": edge, f"PhysicalSize{axis}Unit": _UNITS[record.length_unit]}
@@ -165,7 +169,7 @@ def _ome(record: ReconRecord, facts: str) -> dict[str, Any]:
 
 
 def _tags(record: ReconRecord, facts: dict[str, Any]) -> dict[str, Any]:
-    """What other programs show of it: pixels per cm, and the facts."""
+    """Values that other programs show: pixels per cm, and the metadata."""
     tags: dict[str, Any] = {"photometric": "minisblack", "metadata": facts}
     if record.length_unit == "mm":
         tags |= {"resolution": (10 / record.volume.grid.voxel_size,) * 2, "resolutionunit": "CENTIMETER"}

@@ -1,4 +1,4 @@
-"""Volumes as OME-Zarr."""
+"""Volumes stored as OME-Zarr."""
 
 from beamline.storage.volumes import FormatEntry
 

@@ -28,14 +28,14 @@ from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes import REGISTRY
 from beamline.storage.volumes.base import Slices, facts_of, marked, record_of
 
-_CHUNK = 16, 256, 256  # voxels
-_SMALLEST = 256  # voxels along a side, below which no further scale is made
+_CHUNK = 16, 256, 256  # voxels along each side of a chunk
+_SMALLEST = 256  # voxels along a side; no scale is made below this size
 _KEY = "splatline"
 
 
 @dataclass(frozen=True)
 class OmeZarr:
-    """OME-Zarr; every scale averages 2 x 2 x 2 voxels of the one before; the metadata are JSON in `splatline`."""
+    """OME-Zarr. Each scale averages 2 x 2 x 2 voxels of the scale before. The metadata are JSON in `splatline`."""
 
     name: str = "OME-Zarr"
     suffixes: tuple[str, ...] = REGISTRY["ome_zarr"].suffixes
@@ -43,7 +43,7 @@ class OmeZarr:
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
         zarr, levels = zarr_library(path), _levels(slices.shape)
-        path.mkdir()  # an existing folder is refused
+        path.mkdir()  # raises an error if the folder exists
         group = zarr.create_group(str(path), zarr_format=3)
         scales = [
             group.create_array(
@@ -84,7 +84,7 @@ class OmeZarr:
 
 
 def _means(finer: Any, coarser: Any, z: int, end: int) -> NDArray[Any]:
-    """The slices from `z` to `end` of a scale, from the one before."""
+    """The slices from `z` to `end` of a scale, computed from the finer scale."""
     fz, fy, fx = (2 if n > m else 1 for n, m in zip(finer.shape, coarser.shape, strict=True))
     _, rows, cols = coarser.shape
     part = finer[z * fz : end * fz, : rows * fy, : cols * fx].reshape(end - z, fz, rows, fy, cols, fx)
@@ -93,7 +93,9 @@ def _means(finer: Any, coarser: Any, z: int, end: int) -> NDArray[Any]:
 
 
 def _levels(shape: tuple[int, int, int]) -> list[tuple[int, int, int]]:
-    """Shapes of the scales, each half of the one before along the sides that are longer than one voxel."""
+    """Shapes of the scales. Each scale is half as large as the scale before along the sides that are longer than one
+    voxel.
+    """
     levels = [shape]
     while max(levels[-1]) > _SMALLEST:
         z, y, x = (max(1, n // 2) for n in levels[-1])
@@ -102,14 +104,14 @@ def _levels(shape: tuple[int, int, int]) -> list[tuple[int, int, int]]:
 
 
 def _ome(record: ReconRecord, levels: list[tuple[int, int, int]]) -> dict[str, Any]:
-    """Axes, and of each scale the edge of a voxel and the centre of the first one."""
+    """The axes, and for each scale the edge of a voxel and the centre of the first voxel."""
     grid, unit = record.volume.grid, {"unit": "millimeter"} if record.length_unit == "mm" else {}
     datasets = []
     first, edge = [float(centres[0]) for centres in grid.coordinates()], [float(size) for size in grid.spacing]
     for n, shape in enumerate(levels):
         if n:
             halved = [2 if a > b else 1 for a, b in zip(levels[n - 1], shape, strict=True)]
-            first = [at + size * (by - 1) / 2 for at, size, by in zip(first, edge, halved, strict=True)]
+            first = [centre + size * (by - 1) / 2 for centre, size, by in zip(first, edge, halved, strict=True)]
             edge = [size * by for size, by in zip(edge, halved, strict=True)]
         steps = [{"type": "scale", "scale": edge}, {"type": "translation", "translation": first}]
         datasets.append({"path": str(n), "coordinateTransformations": steps})

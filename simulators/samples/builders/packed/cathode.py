@@ -62,16 +62,18 @@ GREY: Mapping[str, float] = MappingProxyType(
         "gas": 0.0,
     }
 )
-"""Attenuation times the can's radius, in a beam without energies. A cathode of any size with a fill of 0.45 then
-transmits about 5 % at its thickest part."""
+"""Attenuation of each part times the radius of the can, for a beam without energies. With these values, a cathode of
+any size with a fill of 0.45 transmits about 5 % at its thickest part.
+"""
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """Diameters of spheres of the grains' volumes: log-normal, cut off at 2.5 standard deviations.
+    """Sizes of the grains, as diameters of spheres with the same volume. The distribution is log-normal and cut off at
+    2.5 standard deviations.
 
     Attributes:
-        median: mm.
+        median: median diameter in mm.
         spread: standard deviation of the logarithm.
     """
 
@@ -85,7 +87,7 @@ class Sizes:
 
 
 def grain(rng: np.random.Generator, habit: Habit, diameter: float, irregularity: float, aspect: float) -> Grain:
-    """A grain at the origin in any orientation, with the volume of a sphere of `diameter` (mm).
+    """A grain at the origin with a random orientation. It has the volume of a sphere with this `diameter` (mm).
 
     Args:
         irregularity: largest relative change of each axis, before all are scaled to the volume.
@@ -124,13 +126,13 @@ def grains(
     irregularity: float,
     aspect: float,
 ) -> list[Grain]:
-    """Grains until they take `volume` (mm³), to half a grain.
+    """Make grains until their total volume is `volume` (mm³), to within half a grain.
 
     Args:
-        habits: shares of the grains' number, of any sum.
+        habits: shares of the number of grains; the shares may have any sum.
 
     Raises:
-        ValueError: they would be more than MOST.
+        ValueError: there would be more than MOST grains.
     """
     names = list(habits)
     shares = np.array([habits[name] for name in names])
@@ -181,20 +183,21 @@ class Cathode(PieceBuilder):
     alone.
 
     Attributes:
-        diameter, height: mm, of the can outside; it has neither lid nor bottom.
-        wall_um: thickness of the can's wall.
-        size_um: median diameter of spheres of the grains' volumes.
-        spread: standard deviation of the logarithm of the diameter; it is cut off at 2.5 of them. With 2 the largest
-            are 20 000 times the smallest.
-        fill: share of the volume between collector and separator that grains take, pores and cracks included. Balls
-            jam at 0.64.
-        habits: shares of the number of sphere, ellipsoid, octahedron, truncated_octahedron and plate.
+        diameter, height: outer diameter and height of the can in mm. The can has neither lid nor bottom.
+        wall_um: thickness of the wall of the can.
+        size_um: median size of the grains, as the diameter of a sphere with the same volume.
+        spread: standard deviation of the logarithm of the diameter. The distribution is cut off at 2.5 standard
+            deviations. With a spread of 2, the largest grains are 20 000 times as large as the smallest.
+        fill: share of the volume between collector and separator that the grains fill, including their pores and
+            cracks. Random packings of balls jam at 0.64.
+        habits: shares of the number of grains with each shape: sphere, ellipsoid, octahedron, truncated_octahedron and
+            plate.
         irregularity: largest relative change of a grain's axes.
         aspect: width over thickness of plates.
-        hollow, cracked: shares of the grains that have a hole, of half their size, or a crack.
-        gap_um: between two grains, at least.
+        hollow, cracked: shares of the grains that have a hole of half their size, and that have a crack.
+        gap_um: smallest gap between two grains.
         collector_um, separator_um: thickness of the foil below and of the film above; 0: none.
-        seed: of all random numbers.
+        seed: seed of all random numbers.
     """
 
     diameter: Positive = 0.6
@@ -248,7 +251,7 @@ class Cathode(PieceBuilder):
         """The can, its contents and the grains.
 
         Raises:
-            ValueError: a grain is larger than the cell, or there is no room for all; see `arrange`.
+            ValueError: a grain is larger than the cell, or there is no room for all grains; see `arrange`.
         """
         rng = np.random.default_rng(self.seed)
         radius, bed = self.inner_radius, self.bed_height

@@ -1,7 +1,7 @@
-"""Cycle: a battery electrode in the states of a charge and a discharge, as a series of scans sees them.
+"""Cycle: the states of a battery electrode during a charge and a discharge, for a series of scans.
 
-Figures of LiCoO2 agglomerates: growth of 4 % with a spread of 0.5 % (Nat. Nanotechnol. 2023, s41565-023-01466-4); what
-is conserved is the mass, so that the attenuation falls as the volume grows.
+The values are those of LiCoO2 agglomerates: growth of 4 % with a spread of 0.5 % (Nat. Nanotechnol. 2023,
+s41565-023-01466-4). Mass is conserved, so the attenuation falls when the volume grows.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from simulators.samples.sample import TruthTable
 
 LATEST = 0.9  # highest charge at which a crack begins to open
-_TRIED = 2000  # points at which room for the bubble is looked for
+_TRIED = 2000  # number of points at which space for the bubble is searched
 
 
 @dataclass(frozen=True)
@@ -39,15 +39,15 @@ class Cycle:
         states: number of the last state.
         every_s: s from one state to the next; None: the state does not change during a scan.
         growth, spread: mean and standard deviation of the relative change of a particle's volume at charge 1. The
-            contrast of a particle to what surrounds it is multiplied by 1/(1 + growth).
+            contrast of a particle to its surroundings is multiplied by 1/(1 + growth).
         inactive: share of particles that do not grow.
-        swelling: relative change of heights above the lowest particle at charge 1.
-        walk_um, walk_deg: standard deviations of the shift along each axis, and of the turn about the rotation axis,
-            of the whole sample from one state to the next.
+        swelling: relative change, at charge 1, of the heights above the lowest particle.
+        walk_um, walk_deg: standard deviations of the motion of the whole sample from one state to the next: shift along
+            each axis, and rotation about the rotation axis.
         cracked: share of particles that crack. A crack begins to open at a charge between 0.5 and 0.9.
         crack_um: least and largest width of cracks at charge 1.
         healing: share of these cracks that close again while the charge falls.
-        bubble_um: largest diameter of a gas bubble that is there from state 1 on; 0: none.
+        bubble_um: largest diameter of a gas bubble, which exists from state 1 on; 0: no bubble.
         seed: of all random numbers.
     """
 
@@ -78,7 +78,7 @@ class Cycle:
         return float(min(self.state + passed, self.states))
 
     def table(self, pieces: Sequence[Piece]) -> TruthTable:
-        """The truth of each particle at the beginning, by its number from 1."""
+        """The true values of each particle at the beginning, by its number from 1."""
         drawn = _Drawn.of(self, sum(piece.role == "particle" for piece in pieces))
         charge, growth, width = drawn.at(self, self.state)
         moved = [piece.solid.centre for piece in self.at(pieces, self.state) if piece.role == "particle"]
@@ -123,7 +123,9 @@ class Cycle:
         return tuple(_moved(piece, shift, float(turn)) for piece in grown)
 
     def _bubble(self, pieces: Sequence[Piece], grown: Sequence[Piece]) -> list[Piece]:
-        """The bubble in the widest of many places in the electrolyte, the same in all states."""
+        """The bubble. It is at the place in the electrolyte with the most space, among many places, and is the same in
+        all states.
+        """
         own = [piece.solid for piece in pieces if piece.role == "particle"]
         centres = np.array([solid.centre for solid in own])
         reach = np.array([_reach(solid) for solid in own])
@@ -146,10 +148,10 @@ class _Drawn:
     Attributes:
         growth: relative change of the volume at charge 1.
         opens: charge at which its crack begins to open.
-        width: of its crack at charge 1, um; 0: it does not crack.
-        heals: its crack closes while the charge falls.
+        width: width of its crack at charge 1 in um; 0: the particle does not crack.
+        heals: True if its crack closes while the charge falls.
         turns: orientation of its crack.
-        walk: [state, 4] shift (x, y, z) in mm and turn in radians from each state to the next.
+        walk: [state, 4] shift (x, y, z) in mm, and rotation in radians, from each state to the next.
     """
 
     growth: NDArray[np.float64]
@@ -187,7 +189,7 @@ def _reach(solid: object) -> float:
 
 
 def _scaled(piece: Piece, by: float, share: float) -> Piece:
-    """A particle, or a hole in one, `by` times as wide, with its attenuation multiplied by `share`."""
+    """A particle, or a hole in a particle, that is `by` times as wide, with its attenuation multiplied by `share`."""
     solid = piece.solid
     if isinstance(solid, Ellipsoid):
         a, b, c = solid.semi_axes
@@ -204,7 +206,7 @@ def _placed(piece: Piece, centre: Vector) -> Piece:
 
 
 def _moved(piece: Piece, shift: NDArray[np.float64], turn: float) -> Piece:
-    """A piece after a turn about the rotation axis and a shift."""
+    """A piece after a rotation about the rotation axis and a shift."""
     solid, cos, sin = piece.solid, math.cos(turn), math.sin(turn)
     x, y, z = solid.centre
     dx, dy, dz = shift.tolist()

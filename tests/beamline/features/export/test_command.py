@@ -61,7 +61,7 @@ def test_grey_values_say_what_was_clipped(volume: Path) -> None:
 def test_probabilities_of_a_material(folder: Path) -> None:
     """Of a volume at two levels a tenth apart, with noise in each."""
     values = np.where(np.arange(512).reshape(8, 8, 8) % 8 < 4, 0.1, 0.2).astype(np.float32)
-    known = dict(zip(MaterialPrior._fields, ((0.1, 0.2), (0.5, 0.5), 1.0, 0.02), strict=True))
+    known = dict(zip(MaterialPrior._fields, MaterialPrior((0.1, 0.2), (0.5, 0.5), 1.0, 0.02), strict=True))
     settings = {f"{name}_of_materials": np.array(value) for name, value in known.items()}
     record = bare_record(folder / "scan.h5", values, (0.5, 0.5, 0.5))
     write_volume(folder / "v.h5", replace(record, parameters={"method": "discrete", **settings}))

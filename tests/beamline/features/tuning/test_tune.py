@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from beamline.config.load import Config, config_folder, load, plan_of
+from beamline.config.load import Config, config_folder, load
+from beamline.config.planned import plan_of
 from beamline.core.errors import InstrumentError, QualityError, ScanStopped
 from beamline.core.stop import StopRequest
 from beamline.features.tuning.align import Alignment, align

@@ -18,7 +18,7 @@ from beamline.projections.corrections.phase.phase import Phase
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.corrections.rings.rings import Rings
 from beamline.projections.preparation import Preparation
-from beamline.projections.prepared import Corrected, PreparedProjections
+from beamline.projections.prepared import Corrected, PreparedProjections, ScanOrigin
 from beamline.projections.protocols import PrepStep, ScanPart, ScanStep, ViewStep
 from beamline.projections.selection import Selection
 from beamline.projections.step import StepMemory
@@ -101,7 +101,7 @@ def test_a_step_on_all_views_takes_no_more_than_it_states(step: ScanStep) -> Non
         data, ones = views.astype(np.float32), np.ones(n, np.float32)
         found = Projections(data, np.arange(n), 0.0, ones, np.zeros((rows, cols), bool))
         lines = Views(data, part.geometry, None, np.arange(n))
-        prepared = PreparedProjections(lines, Corrected.of(found), (cols - 1) / 2, None, n, "px", "counts")
+        prepared = PreparedProjections(lines, Corrected.of(found), ScanOrigin((cols - 1) / 2, None, n, "px", "counts"))
         assert step.apply(prepared, angles, lambda n, of: None).sentence
 
     assert 0.25 * step.memory(part).alone < peak(work) - 4 * views.size < step.memory(part).alone

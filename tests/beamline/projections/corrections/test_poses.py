@@ -91,7 +91,7 @@ def test_poses_are_those_of_the_file_in_any_order_and_no_pixel_is_resampled(
         np.testing.assert_allclose(getattr(found.geometry, name), getattr(posed(), name), atol=1e-12)
     assert error(found) < 0.2 < 0.5 * error(plain)
     np.testing.assert_array_equal(found.seen.data, plain.seen.data)
-    assert found.done["poses"].sentence.startswith("40 poses from")
+    assert found.origin.done["poses"].sentence.startswith("40 poses from")
 
 
 VECTOR_COLUMNS = "{0}_x,{0}_y,{0}_z,d_x,d_y,d_z,u_x,u_y,u_z,v_x,v_y,v_z"
@@ -122,7 +122,7 @@ def test_vectors_state_all_of_the_geometry(tmp_path: Path, cone: bool, selected:
     pixels = round(found.geometry.pixel_pitch / geometry.pixel_pitch)
     left = found.seen.data - shadow_of_pixels(found.geometry, pixels)
     assert np.abs(left).max() < 2e-3  # counts are rounded
-    assert found.done["poses"].sentence == f"The geometry comes from {text}: vectors of 40 projections."
+    assert found.origin.done["poses"].sentence == f"The geometry comes from {text}: vectors of 40 projections."
 
 
 def test_vectors_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path) -> None:
@@ -201,7 +201,7 @@ def test_the_axis_is_found_with_the_shifts(tmp_path: Path) -> None:
     found = prepared(
         scan(tmp_path, geometry), table(tmp_path, "view,shift_col_px", np.arange(N), drift[:, 0]), axis_col=None
     )
-    assert found.axis_col == pytest.approx(AXIS, abs=0.15)
+    assert found.origin.axis_col == pytest.approx(AXIS, abs=0.15)
 
 
 def test_poses_of_all_views_are_not_needed_where_some_are_chosen(path: Path, tmp_path: Path) -> None:
@@ -298,7 +298,7 @@ def test_a_cone_takes_poses_and_its_axis_is_found_in_them(tmp_path: Path) -> Non
     found = prepared(
         scan(tmp_path, geometry), poses, cone=(10.0, 15.0), pixel_size_mm=1.5 * PITCH, axis_col=None, rows=(2, 22)
     )
-    assert found.axis_col == pytest.approx(AXIS, abs=0.15)
+    assert found.origin.axis_col == pytest.approx(AXIS, abs=0.15)
     left = found.seen.data - ellipsoid_shadow(replace(found.geometry, axis_col=AXIS), AXES, CENTRE)
     assert np.abs(left).max() < 0.02
 

@@ -49,7 +49,7 @@ def _quality(prepared: PreparedProjections) -> float:
 
 def _tilt(prepared: PreparedProjections) -> tuple[str, object]:
     """What was said of the tilt, and the degrees that the file records."""
-    done = prepared.done["tilt"]
+    done = prepared.origin.done["tilt"]
     assert done.parameters is not None
     return done.sentence, done.parameters["tilt_deg"]
 
@@ -76,7 +76,7 @@ def test_the_volume_of_a_tilted_scan_is_as_good_as_that_of_a_straight_one() -> N
     given, _ = prepare(_source(1.5), replace(SELECTION, axis_col=STRAIGHT.axis_col).with_steps(TiltAndLens(1.5)))
     for found in (levelled, given):
         assert _tilt(found)[1] == pytest.approx(1.5, abs=0.05)
-        assert found.axis_col == pytest.approx(STRAIGHT.axis_col, abs=0.25)
+        assert found.origin.axis_col == pytest.approx(STRAIGHT.axis_col, abs=0.25)
         assert _quality(found) > _quality(straight) - 0.3
     assert _quality(as_it_is) < _quality(straight) - 1
 
@@ -85,7 +85,7 @@ def test_the_volume_of_a_tilted_scan_is_as_good_as_that_of_a_straight_one() -> N
 def test_no_tilt_changes_nothing() -> None:
     plain, _ = prepare(_source(1.5), SELECTION)
     zero, said = prepare(_source(1.5), SELECTION.with_steps(TiltAndLens(0.0)))
-    assert not said and _tilt(zero)[0] == "" and zero.measured is None
+    assert not said and _tilt(zero)[0] == "" and zero.sources.measured is None
     np.testing.assert_array_equal(zero.seen.data, plain.seen.data)
     found, said = prepare(_source(0.0), SELECTION.with_steps(TiltAndLens("auto")))
     assert _tilt(found)[1] == 0 and _tilt(found)[0].endswith("not corrected.") and not said
@@ -93,10 +93,10 @@ def test_no_tilt_changes_nothing() -> None:
 
 def test_corners_that_the_detector_did_not_see_weigh_nothing() -> None:
     prepared, _ = prepare(_source(0.0), replace(SELECTION, axis_col=49.3).with_steps(TiltAndLens(5.0)))
-    assert prepared.measured is not None and 0.9 < prepared.measured.mean() < 1
-    assert prepared.measured[8:-8, 4:-4].all() and not prepared.measured[0, -1]
+    assert prepared.sources.measured is not None and 0.9 < prepared.sources.measured.mean() < 1
+    assert prepared.sources.measured[8:-8, 4:-4].all() and not prepared.sources.measured[0, -1]
     weights = prepared.views.weights[...]
-    assert weights is not None and not weights[:, ~prepared.measured].any()
+    assert weights is not None and not weights[:, ~prepared.sources.measured].any()
 
 
 @pytest.mark.slow

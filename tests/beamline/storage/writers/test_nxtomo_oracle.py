@@ -161,9 +161,9 @@ def test_views_and_axis_of_nabu_are_ours(tmp_path: Path) -> None:
     views = np.array([theirs.get_frame(row) for row in rows], np.float32)
     flatfield.FlatField(views.shape, theirs.flats, theirs.darks, radios_indices=rows).normalize_radios(views)
     assert np.abs(-np.log(views) - ours.seen.data).max() < VIEWS_APART
-    assert abs(ours.axis_col - AXIS) < AXIS_APART
+    assert abs(ours.origin.axis_col - AXIS) < AXIS_APART
     for method in ("centered", "octave-accurate", "sliding-window"):
-        assert abs(estimators.estimate_cor(method, theirs) - ours.axis_col) < AXIS_APART, method
+        assert abs(estimators.estimate_cor(method, theirs) - ours.origin.axis_col) < AXIS_APART, method
 
 
 def test_a_full_turn_beside_the_middle_is_half_a_field_of_view(tmp_path: Path) -> None:

@@ -46,7 +46,7 @@ def blocks(shape: tuple[int, int, int], levels: tuple[float, ...], seed: int = 0
 def test_the_posterior_mean_is_that_of_integrals_over_the_true_density(
     materials: MaterialPrior, shape: tuple[int, int, int]
 ) -> None:
-    x, table, levels = blocks(shape, materials.levels), table_of(materials, NOISE), np.array(materials.levels)
+    x, table, levels = blocks(shape, materials.levels), table_of(materials), np.array(materials.levels)
     z, p = np.empty_like(x), np.empty((levels.size, *shape), np.float32)
     posterior_mean(x, table, z, p)
     at = (x.ravel().astype(float) - table.first) * table.scale

@@ -81,3 +81,15 @@ def scanned(scene: Discs, views: int, photons: float, seed: int = 0) -> tuple[F3
 
 def psnr(x: F32, truth: F32) -> float:
     return float(10 * np.log10(truth.max() ** 2 / np.square(x - truth).mean()))
+
+
+def balls_near_one_end(rng: np.random.Generator) -> F32:
+    """A cylinder [z, y, x] of 40 slices, with balls in its lower half: there a trial has its rows."""
+    z, y, x = np.indices((40, 48, 48)) - np.array([19.5, 23.5, 23.5])[:, None, None, None]
+    volume = np.where(np.hypot(y, x) < 22, 0.005, 0).astype(np.float32)
+    for _ in range(60):
+        centre, radius = rng.uniform([-18, -16, -16], [-5, 16, 16]), rng.uniform(2.5, 4)
+        apart = np.sqrt((z - centre[0]) ** 2 + (y - centre[1]) ** 2 + (x - centre[2]) ** 2)
+        if volume[apart < radius + 1].max() < 0.01:
+            volume[apart < radius] = 0.025
+    return volume

@@ -12,7 +12,9 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from scipy import ndimage as ndi
 
+import recon
 from beamline.cli.recon import recon as command
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Sink
@@ -24,13 +26,15 @@ from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.reference import with_reference
 from beamline.report.live_picture import PictureRow, reference_row
 from beamline.storage.readers.open import SourceOptions
-from beamline.storage.volumes.files import opened_volume
+from beamline.storage.volumes.base import bare_record
+from beamline.storage.volumes.files import opened_volume, write_volume
+from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
 from recon.base.method import Preview
 from recon.features.reference.methods import FromReference
 from tests.beamline.cli.small_scan import beamline
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, frames_of, write_flagged
-from tests.recon.features.reference.scene import LEVEL, Discs, N, packed, scanned
+from tests.recon.features.reference.scene import LEVEL, Discs, N, balls_near_one_end, packed, psnr, scanned
 
 QUICK = "--axis", str((N - 1) / 2), "--quality", "preview"
 AFTER = replace(packed(), turn=np.radians(0.8), shift=(1.5, -1.0), slit=4)
@@ -50,7 +54,7 @@ def written(path: Path, scene: Discs, views: int, seed: int) -> Path:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The scans good.h5 and state.h5, and the volume good_volume.h5."""
     folder = tmp_path_factory.mktemp("states")
-    good, _ = written(folder / "good.h5", packed(), 90, 1), written(folder / "state.h5", AFTER, 24, 2)
+    good, _ = written(folder / "good.h5", packed(), 60, 1), written(folder / "state.h5", AFTER, 24, 2)
     done = beamline(
         "recon", str(good), "-m", "fista-tv", *QUICK[:2], "--no-report", "-o", str(folder / "good_volume.h5")
     )
@@ -185,6 +189,39 @@ def test_a_reference_whose_reconstruction_was_stopped_is_not_kept(folder: Path, 
     with pytest.raises(ScanStopped, match=r"good.h5 was stopped, so its volume .* was removed"):
         with_reference(options, folder / "good.h5", stopped, lambda event: None, SystemClock())
     assert not made.exists()
+
+
+@pytest.mark.slow
+def test_slabs_with_a_reference_are_the_whole_volume(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Balls that moved along the axis by 0.1 to 0.9 voxels; each slab finds the reference at its height."""
+    monkeypatch.setattr(FromReference, "halo", 6)  # 24 would need a larger scene
+    truth = balls_near_one_end(rng)
+    truth = np.maximum(truth, truth[::-1])
+    geometry = recon.Geometry.parallel(np.pi * np.arange(24) / 24, (40, 48))
+    grid = recon.Grid.matching(geometry)
+    good, state = tmp_path / "good.h5", tmp_path / "state.h5"
+    np.save(tmp_path / "volume.npy", truth)
+    write_volume(good, bare_record(tmp_path / "volume.npy", truth, (1.0, 1.0, 1.0)))
+    z = (np.arange(40) - 19.5) * 1.02 + 19.5 + 0.5
+    after = ndi.map_coordinates(truth, np.meshgrid(z, np.arange(48), np.arange(48), indexing="ij"), order=1)
+    lines = recon.Projector(geometry, grid).forward(after.astype(np.float32))
+    lines = -np.log(np.maximum(rng.poisson(1e4 * np.exp(-lines)), 1) / 1e4).astype(np.float32)
+    with h5py.File(state, "w") as file:
+        file["exchange/data"], file["exchange/theta"] = lines, np.degrees(geometry.angles)
+        file["exchange/data"].attrs["units"], file["exchange/theta"].attrs["units"] = "line_integrals", "deg"
+        file.attrs["pixel_size_mm"] = 1.0
+    for name, memory in (("whole.h5", "1G"), ("parts.h5", "13M")):
+        done = beamline("recon", str(state), "--reference", str(good), "--axis", "23.5", "--quality", "preview",
+                        "--no-report", "--memory", memory, "-o", str(tmp_path / name))  # fmt: skip
+        assert done.exit_code == 0, done.output
+        assert "The reference was used" in done.output
+    whole, parts = (read_reconstruction(tmp_path / name) for name in ("whole.h5", "parts.h5"))
+    assert int(str(parts.parameters["slabs"])) > 1
+    assert psnr(parts.volume.data, after) > psnr(whole.volume.data, after) - 0.1
+    between = np.square(parts.volume.data - whole.volume.data).mean()
+    assert between < 0.3 * np.square(whole.volume.data - after).mean(), "they differ by less than the error"
 
 
 def test_help_states_the_option() -> None:

@@ -12,7 +12,7 @@ from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.method import DataUse, RunControl
 from recon.base.volume import Volume
-from tests.recon.features.reference.scene import LEVEL, ROWS, Discs, N, packed, psnr, scanned
+from tests.recon.features.reference.scene import LEVEL, ROWS, Discs, N, balls_near_one_end, packed, psnr, scanned
 
 AUTO = recon.Auto((recon.Fbp(), recon.FistaTv()))
 BEFORE = packed()
@@ -134,21 +134,20 @@ def test_in_a_cone_the_volume_is_that_of_auto(before: Volume, state: tuple[F32, 
     np.testing.assert_array_equal(made.volume.data, recon.reconstruct(data, cone, AUTO).volume.data)
 
 
-def _balls_near_one_end(rng: np.random.Generator) -> F32:
-    """A cylinder [z, y, x] of 40 slices, with balls in its lower half: there a trial has its rows."""
-    z, y, x = np.indices((40, 48, 48)) - np.array([19.5, 23.5, 23.5])[:, None, None, None]
-    volume = np.where(np.hypot(y, x) < 22, 0.005, 0).astype(np.float32)
-    for _ in range(60):
-        centre, radius = rng.uniform([-18, -16, -16], [-5, 16, 16]), rng.uniform(2.5, 4)
-        apart = np.sqrt((z - centre[0]) ** 2 + (y - centre[1]) ** 2 + (x - centre[2]) ** 2)
-        if volume[apart < radius + 1].max() < 0.01:
-            volume[apart < radius] = 0.025
-    return volume
+@pytest.mark.slow
+def test_a_slab_beyond_the_reference_is_made_by_auto(before: Volume, state: tuple[F32, recon.Geometry]) -> None:
+    """With the decisions of the slab with most material, in which the reference was used."""
+    decide, method = Decisions(), recon.FromReference(before, AUTO)
+    assert recon.reconstruct(*state, method, control=RunControl(decide=decide)).settings["reference_used"]
+    above = method.at_height(3.0 * ROWS + 20)
+    made = recon.reconstruct(*state, above, control=RunControl(decide=Decisions(0, decide.made)))
+    assert made.method in {each.name for each in AUTO.candidates} and made.change is None
+    assert psnr(made.volume.data, STATE.volume) > 15
 
 
 @pytest.mark.slow
 def test_the_height_of_the_reference_is_that_of_the_rows_that_are_tested(rng: np.random.Generator) -> None:
-    truth = _balls_near_one_end(rng)
+    truth = balls_near_one_end(rng)
     geometry = recon.Geometry.parallel(np.pi * np.arange(30) / 30, (40, 48))
     grid = recon.Grid.matching(geometry)
     exact = recon.Projector(geometry, grid).forward(truth)
@@ -159,5 +158,3 @@ def test_the_height_of_the_reference_is_that_of_the_rows_that_are_tested(rng: np
     assert psnr(made.volume.data, truth) > psnr(recon.reconstruct(data, geometry, AUTO).volume.data, truth) + 6
     material = truth > 0.02
     assert np.median(np.abs(made.displacement[0][material])) < 0.1, "it has not moved along the axis"
-    in_slabs = recon.reconstruct(data, geometry, method, control=RunControl(decide=Decisions()))
-    assert not in_slabs.settings["reference_used"] and "made in slabs" in in_slabs.chosen

@@ -59,7 +59,7 @@ def test_hardening_that_nobody_asked_to_correct_is_said_where_the_masses_show_it
         source = ArraySource(views := _views(bar, energies), [0] * len(views), GEOMETRY.angles)
         source.quantity = "line_integrals"
         scan, _ = prepare(source, Selection(axis_col=49.5))
-        said[energies] = scan.done["hardening"].sentence
+        said[energies] = scan.origin.done["hardening"].sentence
         np.testing.assert_array_equal(scan.seen.data, views)
     assert "Give --hardening fit" in said[ENERGIES] and not said[(30.0,)]
 

@@ -49,12 +49,15 @@ def test_places_and_axis_enter_the_geometry_and_no_pixel_is_resampled(scan: Path
     np.testing.assert_array_equal(found.seen.data, plain.seen.data)
     rest, axis = knowable(found.geometry.shifts - JUMP, found.geometry.angles)
     assert np.sqrt(np.mean(rest**2)) < 0.1
-    assert found.geometry.axis_col + axis == pytest.approx(AXIS, abs=0.1) and found.axis_col == found.geometry.axis_col
-    done = found.done["calibrate"]
+    assert (
+        found.geometry.axis_col + axis == pytest.approx(AXIS, abs=0.1)
+        and found.origin.axis_col == found.geometry.axis_col
+    )
+    done = found.origin.done["calibrate"]
     assert done.sentence.startswith("Geometry calibrated: the axis moves by +")
     assert "The deviation of held-out projections fell from" in done.sentence
     assert done.parameters is not None and done.parameters["calibrate_confirmed"] == "axis,shifts"
-    assert plain.done["calibrate"].sentence == ""
+    assert plain.origin.done["calibrate"].sentence == ""
 
 
 def test_binned_pixels_and_chosen_views_take_their_part(scan: Path) -> None:
@@ -78,7 +81,7 @@ def test_poses_of_a_volume_with_another_axis_are_told(
         steps = Air("none"), PosesOfFile(replace(table, axis_col=known))
         return prepare(scan, Selection(axis_col=given, steps=steps))
 
-    _, warnings = taken(taken(None)[0].axis_col + off)
+    _, warnings = taken(taken(None)[0].origin.axis_col + off)
     assert any("were found with the rotation axis" in each for each in warnings) is told
 
 

@@ -47,16 +47,16 @@ def moved(x: float, z: float) -> NDArray[np.float32]:
 
 def test_views_after_a_jump_are_left_out(tmp_path: Path) -> None:
     found, told = prepared(scan(tmp_path, moved(1.5, 1.0), JUMP), replace(SELECTION, views="first:30"))
-    assert found.geometry.n_views == 30 and found.left_out == 19 and found.view_weights is None
+    assert found.geometry.n_views == 30 and found.origin.left_out == 19 and found.sources.of_views is None
     assert "The sample jumped at frame 45. 19 projections are left out" in told
-    assert "`--calibrate shifts` uses all" in told and found.done["jumps"].sentence in told
+    assert "`--calibrate shifts` uses all" in told and found.origin.done["jumps"].sentence in told
 
 
 def test_another_sample_after_the_jump_is_left_out(tmp_path: Path) -> None:
     views = moved(0.0, 0.0)
     views[LATER] = ball_views(ANGLES[LATER], SHAPE, seed=1)
     found, told = prepared(scan(tmp_path, views, JUMP))
-    assert found.geometry.n_views == JUMP and found.left_out == 19 and not found.geometry.shifts.any()
+    assert found.geometry.n_views == JUMP and found.origin.left_out == 19 and not found.geometry.shifts.any()
     assert "19 projections are left out, because the sample had another position" in told
 
 

@@ -98,7 +98,7 @@ def _prepared(source: ArraySource, *steps: NamedStep) -> PreparedProjections:
 def test_fringes_are_undone_by_default_and_said_with_the_ratio_where_it_is_known() -> None:
     source = _rimmed(0.8)
     found = _prepared(source)
-    sentence = found.done["phase"].sentence
+    sentence = found.origin.done["phase"].sentence
     assert (
         "(from held-out projections)" in sentence
         and "below the air" in sentence
@@ -110,14 +110,14 @@ def test_fringes_are_undone_by_default_and_said_with_the_ratio_where_it_is_known
     still = _prepared(source, Phase(None))
     assert found.seen.data.min() > 0.5 * still.seen.data.min()  # less light beyond the open beam
     source.energy_kev, source.pixel_size_mm = 25.0, 4.6e-3
-    ratio = _prepared(source, Phase(distance_mm=30.0)).done["phase"].sentence.split("delta/beta ")[1]
+    ratio = _prepared(source, Phase(distance_mm=30.0)).origin.done["phase"].sentence.split("delta/beta ")[1]
     assert float(ratio.split(" at 25 keV, 30 mm")[0]) == pytest.approx((length / 0.0748) ** 2, rel=0.03)
 
 
 def test_without_fringes_views_are_those_of_none_to_the_bit() -> None:
     found, still = (_prepared(_rimmed(0.0), *steps) for steps in ((), (Phase(None),)))
     np.testing.assert_array_equal(found.seen.data, still.seen.data)
-    assert found.done["phase"].sentence == "" and dict(found.done["phase"].parameters or {}) == {
+    assert found.origin.done["phase"].sentence == "" and dict(found.origin.done["phase"].parameters or {}) == {
         "phase": "not retrieved"
     }
 
@@ -125,7 +125,7 @@ def test_without_fringes_views_are_those_of_none_to_the_bit() -> None:
 def test_an_overshoot_that_no_filter_explains_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("recon.features.phase.length_by_held_out_views", lambda *_: None)
     found = _prepared(_rimmed(0.8))
-    assert "--phase auto found no filter" in found.done["phase"].sentence
+    assert "--phase auto found no filter" in found.origin.done["phase"].sentence
     np.testing.assert_array_equal(found.seen.data, _prepared(_rimmed(0.8), Phase(None)).seen.data)
 
 
@@ -133,7 +133,7 @@ def test_a_filter_that_explains_little_is_told_of_and_not_applied(monkeypatch: p
     """It blurs: a tooth's thin cracks lose half their depth by one that predicts views held out 8 % better."""
     monkeypatch.setattr("recon.features.phase.length_by_held_out_views", lambda *_: FilterLength(1.4, 1.1, 0.08))
     found = _prepared(_rimmed(0.8))
-    sentence = found.done["phase"].sentence
+    sentence = found.origin.done["phase"].sentence
     assert "over 1.4 pixels would lower the residual in held-out projections by 8%" in sentence
     np.testing.assert_array_equal(found.seen.data, _prepared(_rimmed(0.8), Phase(None)).seen.data)
 
@@ -150,5 +150,5 @@ def test_the_search_takes_no_more_memory_than_it_states() -> None:
 
 
 def test_an_unsharp_mask_that_no_filter_precedes_is_not_dropped_without_a_word() -> None:
-    sentence = _prepared(_rimmed(0.0), Phase(unsharp=(1.5, 2.0))).done["phase"].sentence
+    sentence = _prepared(_rimmed(0.0), Phase(unsharp=(1.5, 2.0))).origin.done["phase"].sentence
     assert "No phase retrieval" in sentence and "--unsharp has no effect" in sentence
