@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
@@ -81,19 +82,27 @@ def kernel(here: Path) -> Iterator[tuple[KernelManager, Any]]:
 def _interrupted(kernel: tuple[KernelManager, Any], code: str, begun: Callable[[str], bool], times: int) -> str:
     """The texts of a cell that is interrupted `times` times once its output says that it has `begun`."""
     manager, client = kernel
-    client.execute(code)
+    cell = client.execute(code)
     text, left, end = "", times, time.monotonic() + 180
     while time.monotonic() < end:
         message = client.get_iopub_msg(timeout=120)
+        if message["parent_header"].get("msg_id") != cell:
+            continue
         kind, content = message["msg_type"], message["content"]
         text += content.get("text", "") + "\n".join(content.get("traceback", ()))
-        if kind == "status" and content["execution_state"] == "idle" and left < times:
+        if kind == "status" and content["execution_state"] == "idle":
+            assert left < times or not times, text
             return text
         if left and kind == "stream" and begun(text):
             manager.interrupt_kernel()
             left -= 1
             time.sleep(0.5)
     raise AssertionError(text)
+
+
+def _names(folder: Path) -> set[str]:
+    """The files in the folder of a kernel, also hidden ones, without the temporary files of the kernel itself."""
+    return {path.name for path in folder.iterdir() if not path.name.startswith(("tmp", "matplotlib"))}
 
 
 CALL = """
@@ -112,7 +121,7 @@ def test_an_interrupted_call_leaves_a_whole_volume_or_none(
 ) -> None:
     write_exchange(here / "scan.h5", TwoCylinders())
     said = _interrupted(kernel, CALL, lambda text: "fista-tv starts" in text, times)
-    names = {path.name for path in here.iterdir() if not path.name.startswith(("tmp", ".", "matplotlib"))}
+    names = _names(here)
     if "KeyboardInterrupt" in said:
         assert names == {"scan.h5"}
     else:
@@ -124,8 +133,39 @@ def test_an_interrupted_command_leaves_no_part_of_a_file(kernel: tuple[KernelMan
     write_exchange(here / "scan.h5", TwoCylinders())
     command = "!beamline recon scan.h5 -m fista-tv --iterations 100000 --tv-weight 1e-4 -o volume.h5"
     _interrupted(kernel, command, lambda text: "volume:" in text or "starts" in text, 1)
-    names = {path.name for path in here.iterdir() if not path.name.startswith(("tmp", ".", "matplotlib"))}
+    names = _names(here)
     assert names in ({"scan.h5"}, {"scan.h5", "volume.h5", "volume.html"})
+
+
+INTERRUPTED = {
+    "first_reconstruction": ("!beamline recon ", "fista-tv starts"),
+    "others_scans": ("!beamline sweep ", "trials: 0/5"),
+    "operando_series": ("!{queue}\n", "Scan 2 of 4"),
+}
+"""A cell of each notebook, and the text of its output after which the kernel is interrupted."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_an_interrupted_cell_of_a_notebook_leaves_whole_files_and_runs_again(
+    path: Path, kernel: tuple[KernelManager, Any], here: Path
+) -> None:
+    cell, begun = INTERRUPTED[path.stem]
+    sources = [f"{each['source']}\n" for each in jupytext.read(path).cells if each["cell_type"] == "code"]
+    (place,) = (n for n, source in enumerate(sources) if cell in source)
+    for source in sources[:place]:
+        _interrupted(kernel, source, lambda text: False, 0)
+    said = _interrupted(kernel, sources[place], lambda text: begun in text, 1)
+    assert begun in said
+    (prefix,) = re.findall(r'mkdtemp\(prefix="(.*)"', path.read_text(encoding="utf-8"))
+    (folder,) = here.glob(f"{prefix}*")
+    files = [each for each in folder.rglob("*") if each.is_file()]
+    assert not [each for each in files if each.name.startswith(".") or each.suffix in (".partial", ".new")], said
+    for each in files:
+        if each.suffix == ".h5":
+            h5py.File(each).close()
+    again = _interrupted(kernel, sources[place], lambda text: False, 0)
+    assert "beamline: " not in again and "Traceback" not in again, again
 
 
 def test_a_cell_gets_lines_in_place_of_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -131,7 +131,7 @@ ELSEWHERE = {
         "pip install --no-compile -c constraints.txt -e . && beamline demo",
     ): "the gate: .ci/wheel; the second line is one of those of FILES",
     ("README.md", 'pip install -c constraints.txt -e ".[dev]" && pytest -n auto'): "the gate: .ci/run",
-    ("docs/tutorials.md", "pip install splatline-structure"): "the gate: .ci/wheel",
+    ("docs/tutorials.md", "pip install packages/splatline-structure"): "the gate: .ci/wheel",
     ("docs/tutorials.md", "beamline demo"): "the gate: .ci/wheel",
     ("docs/python.md", "bluesky-0MQ-proxy 5577 5578 &"): "tests/beamline/bluesky/test_zmq.py, at ports that are free",
     (

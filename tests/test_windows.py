@@ -1,22 +1,27 @@
-"""What can be tried of Windows on Linux: consoles with a code page, files that nobody replaces or removes while they
-are open, no `fork`, and processes by spawn.
+"""What can be tried of Windows and macOS on Linux: consoles with a code page, files that nobody replaces or removes
+while they are open, no `fork`, processes by spawn, and folders that ignore the case of names.
 
-Each command runs in a process whose `sitecustomize` takes away what Windows lacks. Paths, locks and signals stay those
-of Linux (see `test_platforms`), and no file system here ignores the case of names.
+A command "as on Windows" runs in a process whose `sitecustomize` takes away what Windows lacks. Paths, locks and
+signals stay those of Linux (see `test_platforms`). A folder ignores case because a preloaded library looks names up
+like that (Linux; needs `cc`), or because it is a disk of NTFS (needs root and ntfs-3g).
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
+import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from beamline.config.load import config_folder
 from beamline.core.errors import DataError
-from beamline.core.files import atomic_file
+from beamline.core.files import atomic_file, same_file
 
 ROOT = Path(__file__).parents[1]
 linux = pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="which files are open is read from /proc")
@@ -148,3 +153,118 @@ def test_a_file_that_a_viewer_holds_open_stays_and_nothing_is_left(
     with pytest.raises(DataError, match="the existing file was not changed"), atomic_file(path, replace=True) as new:
         new.write_text("new", encoding="utf-8")
     assert [each.name for each in tmp_path.iterdir()] == ["volume.h5"] and path.read_text(encoding="utf-8") == "old"
+
+
+RUN = """
+import json, sys
+from click.testing import CliRunner
+from beamline.cli.main import main
+done = [CliRunner().invoke(main, words) for words in json.loads(sys.argv[1])]
+print(json.dumps([[each.exit_code, each.output] for each in done]))
+"""
+CASELESS = Path(__file__).with_name("caseless_folder.c")
+NTFS = "mkntfs", "lowntfs-3g", "umount"
+
+
+def _preloaded(tmp_path: Path) -> dict[str, str]:
+    made, folder = tmp_path / "caseless.so", tmp_path / "disk"
+    subprocess.run(["cc", "-shared", "-fPIC", "-O1", "-o", made, CASELESS, "-ldl"], check=True, timeout=120)
+    return {"LD_PRELOAD": str(made), "CASELESS_FOLDER": str(folder)}
+
+
+@pytest.fixture(params=["preloaded", "mounted"])
+def caseless(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Path, dict[str, str]]]:
+    """A folder that ignores the case of names, and the environment of the processes that find it so."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    common = {**os.environ, "PYTHONPATH": str(ROOT)}
+    if request.param == "preloaded":
+        if not sys.platform.startswith("linux") or shutil.which("cc") is None:
+            pytest.skip("the library that ignores case needs Linux and a C compiler (cc)")
+        yield folder, common | _preloaded(tmp_path)
+        return
+    if not all(map(shutil.which, NTFS)) or os.geteuid() or not os.access("/dev/fuse", os.R_OK | os.W_OK):
+        pytest.skip("a disk of NTFS needs root, ntfs-3g and /dev/fuse")
+    image = tmp_path / "disk.img"
+    with image.open("wb") as file:
+        file.truncate(64 << 20)
+    subprocess.run(["mkntfs", "-F", "-f", "-q", image], check=True, capture_output=True, timeout=60)
+    subprocess.run(["lowntfs-3g", "-o", "ignore_case", image, folder], check=True, timeout=60)
+    yield folder, common
+    subprocess.run(["umount", folder], check=True, timeout=60)
+
+
+def _in(caseless: tuple[Path, dict[str, str]], *commands: str) -> list[tuple[int, str]]:
+    """The exit codes and outputs of commands, run one after the other by one process in the folder."""
+    words = json.dumps([command.split(" ") for command in commands])
+    done = subprocess.run(
+        [sys.executable, "-c", RUN, words],
+        cwd=caseless[0],
+        env=caseless[1],
+        capture_output=True,
+        text=True,
+        timeout=280,
+    )
+    assert done.returncode == 0, done.stderr
+    return [(code, output) for code, output in json.loads(done.stdout)]
+
+
+SIMULATE = "simulate plain --frames 24 --set detector.shape=[8,32] --set detector.pixel_size_um=20 -o"
+
+
+@pytest.mark.slow
+def test_a_name_in_other_case_is_the_file_that_exists(caseless: tuple[Path, dict[str, str]]) -> None:
+    folder = caseless[0]
+    made = _in(caseless, f"{SIMULATE} scan.h5", "recon scan.h5 -m fbp -o volume.h5")
+    assert [code for code, _ in made] == [0, 0], made
+    before = {path.name: hashlib.sha256(path.read_bytes()).digest() for path in folder.iterdir()}
+    exists, same, twice = "exists, and results are never overwritten", "are the same file", "is given for the scan and"
+    refused = {
+        f"{SIMULATE} SCAN.h5": (5, exists),
+        f"{SIMULATE} two.h5 --truth TWO.h5": (2, twice),
+        "recon SCAN.h5 -m fbp -o Volume.h5": (5, exists),
+        "recon scan.h5 -m fbp -o SCAN.h5": (2, same),
+        "recon scan.h5 -m r2 -o new.h5 --checkpoint NEW.h5": (2, same),
+        "export volume.h5 -o VOLUME.h5": (2, same),
+    }
+    for command, (code, output) in zip(refused, _in(caseless, *refused), strict=True):
+        expected, text = refused[command]
+        assert code == expected and text in " ".join(output.split()), (command, output)
+    assert {path.name: hashlib.sha256(path.read_bytes()).digest() for path in folder.iterdir()} == before
+    (other,) = _in(caseless, "recon SCAN.h5 -m fbp -o other.h5")
+    assert other[0] == 0, other
+
+
+@pytest.mark.slow
+def test_results_whose_names_differ_in_case_get_folders_of_their_own(caseless: tuple[Path, dict[str, str]]) -> None:
+    folder = caseless[0]
+    assert _in(caseless, f"{SIMULATE} scan.h5")[0][0] == 0
+    for name in ("a/scan.h5", "B/SCAN.h5"):
+        (folder / name).parent.mkdir()
+        shutil.copy(folder / "scan.h5", folder / name)
+    (folder / "recipe.yaml").write_text("method: fbp\n", encoding="utf-8")
+    (folder / "my.yaml").write_bytes((config_folder() / "simulated.yaml").read_bytes())
+    (folder / "queue.csv").write_text("config,sample.name\nmy.yaml,Tooth\nmy.yaml,tooth\n", encoding="utf-8")
+    few = (
+        "scan.angles.views=12", "scan.period_s=1", "devices.camera.roi=[1140,2032,24,32]",
+        "devices.stage.low_deg=-90", "simulation.clock=virtual",
+    )  # fmt: skip
+    scan = f"scan queue.csv --no-live {' '.join(f'--set {each}' for each in few)}"
+    batch = "batch a/scan.h5 B/SCAN.h5 --config recipe.yaml -o"
+    made = _in(caseless, scan, f"{batch} day", f"{batch} DAY")
+    assert [code for code, _ in made] == [0, 0, 0], made
+    assert len({path.name.lower() for path in (folder / "runs").iterdir() if (path / "scan.h5").is_file()}) == 2
+    assert len({path.name.lower() for path in (folder / "day").iterdir() if (path / "recon.h5").is_file()}) == 2
+    assert len([path for path in folder.iterdir() if path.name.lower() == "day"]) == 1
+
+
+def test_two_names_are_one_file_where_the_folder_says_so(tmp_path: Path) -> None:
+    scan, link = tmp_path / "scan.h5", tmp_path / "link.h5"
+    scan.write_text("frames", encoding="utf-8")
+    link.symlink_to(scan)
+    assert same_file(scan, link) and same_file(tmp_path / "new.h5", tmp_path / "new.h5")
+    assert not same_file(scan, tmp_path / "new.h5")
+    ignores = (tmp_path / "SCAN.h5").exists()
+    assert same_file(scan, tmp_path / "SCAN.h5") is same_file(tmp_path / "new.h5", tmp_path / "NEW.h5") is ignores
+    assert not same_file(tmp_path / "missing" / "new.h5", tmp_path / "missing" / "NEW.h5")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link.h5", "scan.h5"]

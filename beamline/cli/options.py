@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
@@ -19,6 +18,7 @@ from click.exceptions import ClickException, Exit
 
 from beamline.core.errors import exit_code, user_message
 from beamline.core.events import Event, Failed, Sink
+from beamline.core.files import same_file
 from beamline.core.sinks import JsonLines, fan_out
 from drivers.base.clock import SystemClock
 from recon.base.registry import unknown
@@ -315,12 +315,10 @@ def refuse_shared(files: Mapping[str, Path | None]) -> None:
 
     Only --checkpoint may replace the file of --resume.
     """
-    named = {option: os.path.normcase(os.path.realpath(path)) for option, path in files.items() if path is not None}
-    for first, second in itertools.combinations(named, 2):
-        if named[first] == named[second] and {first, second} != {"--checkpoint", "--resume"}:
-            raise click.UsageError(
-                f"{first} and {second} are the same file, {files[second]}. Give two different files."
-            )
+    named = [(option, path) for option, path in files.items() if path is not None]
+    for (first, path), (second, other) in itertools.combinations(named, 2):
+        if {first, second} != {"--checkpoint", "--resume"} and same_file(path, other):
+            raise click.UsageError(f"{first} and {second} are the same file, {other}. Give two different files.")
 
 
 @contextmanager

@@ -250,6 +250,27 @@ def refuse_not_utf8(path: Path | str) -> None:
         ) from error
 
 
+def same_file(first: Path, second: Path) -> bool:
+    """Whether two paths name one file, even one that is still to be written.
+
+    Two names that differ only in upper and lower case are one file on the disks of Windows and macOS, and on many USB
+    disks. A short-lived file in the folder of `first` tells whether its disk is of that kind.
+    """
+    names = os.path.realpath(first), os.path.realpath(second)
+    if names[0] == names[1] or names[0].casefold() != names[1].casefold():
+        return names[0] == names[1]
+    with suppress(OSError):
+        if first.exists() or second.exists():
+            return first.exists() and first.samefile(second)
+        probe = first.with_name(f"aB-{uuid.uuid4().hex[:8]}")
+        probe.touch(exist_ok=False)
+        try:
+            return probe.with_name(probe.name.swapcase()).exists()
+        finally:
+            probe.unlink()
+    return False
+
+
 def replaceable(path: Path) -> Path:
     """The file to replace or create for `path`. If `path` is a link, this is the target of the link.
 

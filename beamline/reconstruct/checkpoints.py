@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.files import refuse_existing
+from beamline.core.files import refuse_existing, same_file
 from beamline.core.sinks import Warn
 from beamline.projections.prepared import PreparedProjections
 from beamline.storage.recon_record import Value
@@ -95,7 +95,7 @@ class CheckpointOptions:
         """
         if self.resume is not None:
             _read_state(self.resume)
-        if self.path is not None and not (self.resume is not None and self.path.resolve() == self.resume.resolve()):
+        if self.path is not None and not (self.resume is not None and same_file(self.path, self.resume)):
             refuse_existing(self.path)
 
     def begin(self, origin: Mapping[str, Value], steps: int, warn: Warn) -> Mapping[str, NDArray[Any]] | None:

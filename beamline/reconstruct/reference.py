@@ -10,6 +10,7 @@ import numpy as np
 
 from beamline.core.errors import DataError, ScanStopped
 from beamline.core.events import Sink, StateEntered
+from beamline.core.files import same_file
 from beamline.core.quantities import VoxelKind
 from beamline.core.recon_events import VolumeDone
 from beamline.core.text import safe_name
@@ -93,7 +94,7 @@ def _too_few(options: ReconOptions) -> bool:
 def _of_this_scan(made: Path, scan: Path) -> Path:
     """The path of a volume. Raises DataError if it was made from another scan."""
     with opened_volume(made) as record:
-        if Path(record.raw_file) != scan.resolve():
+        if not same_file(Path(record.raw_file), scan):
             raise DataError(
                 f"{made} was made from {record.raw_file}, not from {scan.resolve()}. Move it away, or give the volume "
                 "of the reference instead of its scan. Nothing was changed."

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.event_lines import LARGEST_LOG, LONGEST
-from beamline.core.files import EVENTS, JOINED, SCAN, atomic_file, open_below, parts_of, run_of
+from beamline.core.files import EVENTS, JOINED, SCAN, atomic_file, open_below, parts_of, run_of, same_file
 from beamline.core.process import json_object
 from beamline.monitor.digest import has_checksum
 from beamline.storage import datasets, hdf5
@@ -137,7 +137,7 @@ def join(parts: Sequence[Path], joined: Path) -> int:
 def other_parts(part: Path) -> list[Path]:
     """The files of the other parts of the same run that may contain frames, whether they are joined or not."""
     part = part.resolve()
-    return [file for file in files_with_frames(run_of(part.parent), part.name) if file != part]
+    return [file for file in files_with_frames(run_of(part.parent), part.name) if not same_file(file, part)]
 
 
 def files_with_frames(run: Path, name: str = SCAN) -> list[Path]:
@@ -169,7 +169,7 @@ def joined_file_of(part: Path) -> tuple[Path, int] | None:
     for folder in (part.parent, part.parent.parent):  # the joined file of the run, or the joined file in a later part
         with suppress(DataError, *hdf5.ALTERED), hdf5.open_hdf5(folder / JOINED) as file:
             names = [source.file_name for source in file[layout.DATA].virtual_sources()]
-            if part in [(folder / name).resolve() for name in names]:
+            if any(same_file(folder / name, part) for name in names):
                 return folder / JOINED, len(names)
     return None
 
@@ -216,7 +216,7 @@ def _disagreement(joined: h5py.File, folder: Path) -> str:
                 return (
                     f"the part {part} has {committed} frames instead of the {n} that it had when the parts were joined"
                 )
-    others = [other for other in other_parts(parts[0]) if other not in [part.resolve() for part in parts]]
+    others = [other for other in other_parts(parts[0]) if not any(same_file(other, part) for part in parts)]
     return f"the frames of {others[0]} are missing" if others else ""
 
 

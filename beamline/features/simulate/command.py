@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import itertools
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +13,7 @@ from beamline.cli.options import WholeRange, json_events, with_request
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Done, Sink, StepsListed
-from beamline.core.files import refuse_existing, remove, write_whole
+from beamline.core.files import refuse_existing, remove, same_file, write_whole
 from beamline.core.installed import shipped_scenes
 from beamline.core.machine import free_memory
 from beamline.core.sinks import fan_out
@@ -196,15 +196,13 @@ def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) 
     from beamline.simulate import labels_path
 
     named = {"the scan": out, "its labels": out and labels_path(out), "the truth": truth, "the picture": picture}
-    seen: dict[str, str] = {}
-    for what, path in named.items():
-        if path is None:
-            continue
-        other = seen.setdefault(os.path.realpath(path), what)
-        if other is not what:
+    given = {what: path for what, path in named.items() if path is not None}
+    for (what, first), (other, second) in itertools.combinations(given.items(), 2):
+        if same_file(first, second):
             raise ConfigError(
-                f"{path} is given for {other} and for {what}: use two different files. Nothing was simulated."
+                f"{second} is given for {what} and for {other}: use two different files. Nothing was simulated."
             )
+    for path in given.values():
         refuse_existing(path)
 
 
