@@ -151,8 +151,7 @@ def _refuse_size(shape: tuple[int, int], dtype: np.dtype[Any], codec: str, pixel
     if not 0 < n_bytes <= MOST_BYTES or not (codec or pixels.nbytes == n_bytes):
         raise FrameRefusedError(
             f"the frame has {pixels.nbytes} bytes, which does not match the dimensions, {shape[0]} x {shape[1]} "
-            f"{dtype}, or "
-            f"is more than {MOST_BYTES >> 20} MB"
+            f"{dtype}, or is more than {MOST_BYTES >> 20} MB"
         )
 
 

@@ -61,7 +61,7 @@ def test_chunks_of_a_file_with_their_header_are_decoded_too() -> None:
 
 
 def test_a_damaged_frame_says_so() -> None:
-    with pytest.raises(ValueError, match="its bslz4 pixels cannot be decoded"):
+    with pytest.raises(ValueError, match="the bslz4 pixels cannot be decoded"):
         decoded("bslz4", np.zeros(20, np.uint8), (4, 4), np.dtype("u2"))
 
 
@@ -73,7 +73,7 @@ def test_sizes_that_no_frame_has_are_refused_before_memory_is_taken(codec: str, 
         value.codec = {"name": codec, "parameters": 6}
     value.dimension = [{"size": n, "offset": 0, "fullSize": n, "binning": 1, "reverse": False} for n in sides]
     began = time.monotonic()
-    with pytest.raises(FrameRefusedError, match=f"match its dimensions, {sides[1]} x {sides[0]} uint16, or is more"):
+    with pytest.raises(FrameRefusedError, match=f"match the dimensions, {sides[1]} x {sides[0]} uint16, or is more"):
         array_frame(value, 0.0)
     assert time.monotonic() - began < 1
 

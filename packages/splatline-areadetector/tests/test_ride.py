@@ -112,9 +112,7 @@ def test_a_first_projection_that_is_lost_shows_at_the_end_and_it_is_said_that_it
         told = ride_along(config_of(tmp_path, ioc.url, angles, first_id=first_id), tmp_path, scan)
     (file,) = stored(tmp_path)
     assert isinstance(told.error, LedgerError) and file.missing == ([7] if first_id is None else [0])
-    undecided = (
-        "the missing frame may be the first: then all angles are 0.5° larger than stated, which rotates the volume"
-    )
+    undecided = "the missing frame may be the first of the scan. If so, all angles are 0.5° larger than stated"
     assert (undecided in str(told.error)) is (first_id is None)
 
 

@@ -152,5 +152,5 @@ def test_a_frame_of_no_pixels_is_refused(tmp_path: Path) -> None:
     value.dimension = [{"size": n, "offset": 0, "fullSize": n, "binning": 1, "reverse": False} for n in (0, 16)]
     with FakeIoc() as ioc:
         told = ride_along(config_of(tmp_path, ioc.url, PLAN), tmp_path, lambda stop: ioc.post(value))
-    assert isinstance(told.error, ConfigError) and "not match its dimensions, 16 x 0 uint16" in str(told.error)
+    assert isinstance(told.error, ConfigError) and "not match the dimensions, 16 x 0 uint16" in str(told.error)
     assert not stored(tmp_path)

@@ -37,7 +37,7 @@ def test_a_script_of_the_user_by_the_name_of_a_package(tmp_path: Path) -> None:
     expected = (
         f"Python finds 'recon' at {tmp_path / 'recon.py'} instead of that of splatline at {ROOT / 'recon/__init__.py'}"
     )
-    assert told == f"ImportError: {expected}: rename that one, or work in another folder."
+    assert told == f"ImportError: {expected}: rename that file or folder, or work in another folder."
     done = run(command, tmp_path)
     assert (done.stdout, done.stderr, done.returncode) == ("", told.replace("ImportError", "beamline") + "\n", 2)
 
@@ -60,7 +60,7 @@ def environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_distribution_that_has_overwritten_a_package(environment: Path) -> None:
     told = installed.package_problem(str(environment))
     assert told.startswith(
-        f"{environment / 'drivers/__init__.py'} is not splatline's: it belongs to another distribution"
+        f"{environment / 'drivers/__init__.py'} is not splatline's: this package belongs to another distribution"
     )
 
 
@@ -92,7 +92,7 @@ def test_a_library_that_cannot_be_loaded_is_no_defect(
         assert each is not None and exit_code(each) == 2 and not is_defect(each)
     told = user_message(error)
     assert told.startswith("the library 'broken' cannot be loaded (") and why in told
-    assert f"Python finds it at {tmp_path / 'broken' / '__init__.py'}. If this is a different package, rename" in told
+    assert f"Python finds a library of this name at {tmp_path / 'broken' / '__init__.py'}. If this is a" in told
 
 
 def test_an_installed_library_is_installed_again_and_a_missing_one_installed(
@@ -124,7 +124,7 @@ def test_a_file_of_the_user_by_the_name_of_a_library(name: str, said: str, tmp_p
     command.write_text("from beamline.cli.main import run\nrun()\n", encoding="utf-8")
     done = run(command, tmp_path)
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
-    assert said in done.stderr and str(file) in done.stderr and "rename that one" in done.stderr
+    assert said in done.stderr and str(file) in done.stderr and "rename that file or folder" in done.stderr
 
 
 @pytest.mark.parametrize(

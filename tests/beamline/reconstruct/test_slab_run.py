@@ -142,7 +142,7 @@ def test_a_dry_run_says_what_is_left(folder: Path, monkeypatch: pytest.MonkeyPat
     assert all_of_it["scratch"] - rest["scratch"] == rest["output"] and rest["memory"] == all_of_it["memory"]
     said = beamline(*FISTA, "--resume", "out.partial.h5", "--dry-run").stdout
     assert "2 slabs remaining; 32 of 96" in said
-    assert "about 1.67 min; about 50 s if the data let it stop early; reading" in said
+    assert "about 1.67 min; about 50 s if the method ends early with these data; reading" in said
     other = beamline(*FISTA, "--rows", "0:80", "--resume", "out.partial.h5", "--dry-run")
     assert other.exit_code == 5 and "contains a volume of 96 slices, but this reconstruction has 80" in other.stderr
     assert Path("out.partial.h5").read_bytes() == before and left(folder) == {"scan.h5", "out.partial.h5"}

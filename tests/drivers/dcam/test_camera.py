@@ -144,7 +144,7 @@ def test_a_count_of_frames_that_goes_back_is_said_and_not_waited_out(camera: Dca
 def test_a_state_that_the_interface_does_not_have_is_an_error_of_the_device(camera: DcamCamera, world: World) -> None:
     camera.arm(1)
     world.fault("odd_status", 9)
-    with pytest.raises(DeviceError, match="status is 9"):
+    with pytest.raises(DeviceError, match="status of the camera is 9"):
         camera.next_frame(1.0)
 
 

@@ -167,8 +167,8 @@ def test_ranges_and_lists(text: str, expected: tuple[str, tuple[str, ...]]) -> N
         ("tv_weigt=1,2", "did you mean tv-weight?"),
         ("rings", "expected NAME=A:B:STEP"),
         ("rings=vo", "at least two"),
-        ("axis=5:1:1", "does not get from"),
-        ("axis=1:5:0", "does not get from"),
+        ("axis=5:1:1", "does not lead from"),
+        ("axis=1:5:0", "does not lead from"),
         ("axis=1:5000:1", "use a larger STEP"),
     ],
 )

@@ -57,7 +57,7 @@ def test_the_angles_of_a_table_are_in_the_column_that_is_named_so(tmp_path: Path
         (table("frame,theta", "{i},{deg}"), "::omega", "columns are frame, theta"),
         (table("", "{i},{deg}"), "::2", "its 2 columns have no names"),
         (table("", "{i},{deg}"), "", "number of a projection and its angle.* FILE::COLUMN"),
-        (table("frame,theta [turns]", "{i},{deg}"), "", "unit of its angles is 'turns'; give --angles-unit"),
+        (table("frame,theta [turns]", "{i},{deg}"), "", "unit of the angles is 'turns'; give --angles-unit"),
         ("frame,theta\n0,0\n1,\n2,4", "", r"line 3 contains '\(empty\)'"),
         ("0 deg\n2 deg", "", "line 1 contains '0 deg'"),
         ("0.5°\n2.5°", "", "line 1 contains '0.5°'"),

@@ -254,8 +254,8 @@ def test_wrong_frames_are_refused_and_nothing_is_written(
         (replace(good, counts=good.counts[:-1]), r"uint16 \(11, 16\); expected uint16 \(12, 16\)"),
         (replace(good, counts=good.counts.astype(np.float32)), "float32"),
         (replace(good, counts=good.counts.astype(np.int16)), "int16"),
-        (replace(good, index=2), "index is 2; expected 1"),
-        (replace(good, index=0), "index is 0; expected 1"),
+        (replace(good, index=2), "index of the frame is 2; expected 1"),
+        (replace(good, index=0), "index of the frame is 0; expected 1"),
     ):
         with pytest.raises(DataError, match=said):
             writer.append(bad, digest(good.counts))

@@ -152,7 +152,7 @@ def test_a_toggled_output_rests_after_a_train_and_after_disarming_in_the_middle(
 def test_firmware_without_schedule_says_so_and_is_served_by_toggling() -> None:
     rig = Rig(can_schedule=False)
     bench = rig.bench()
-    with pytest.raises(DeviceRefused, match=r"be set up.*schedule.*toggle.*not armed"):
+    with pytest.raises(DeviceRefused, match=r"be set up.*schedule.*toggle.*no trigger pulses"):
         bench.stage.arm(bench.train(1.0, 1.0, 3))
     bench.go(10.0)
     assert bench.pulses() == []

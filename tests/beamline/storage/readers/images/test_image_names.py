@@ -155,7 +155,7 @@ def test_images_that_are_not_read_are_named_with_a_way(tmp_path: Path) -> None:
     (tmp_path / "s.pickle").write_bytes(b"cos\nsystem\n(S'exit 1'\ntR.")
     for name, message in {
         "jpg": r"pictures such as p_1.jpg .* 8 bits.*PNG.*PIL.*\*\.jpg",
-        "png": "it has 6 x 4 pixels of kind RGB; expected grey pixels",
+        "png": "the image has 6 x 4 pixels of kind RGB; expected grey pixels",
         "s.npz": "numpy.savez.*Python objects among its arrays.*pickles",
         "s.pickle": "is a pickle, which this program never opens.*np.save",
     }.items():
