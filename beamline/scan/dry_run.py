@@ -101,11 +101,11 @@ class DryRun:
 
     def _states_in_words(self) -> str:
         longest, every = max(one.duration for one in self.states), self.every
-        when = "each when `beamline resume` is sent" if every is None else f"one every {hms_text(every)}"
+        when = "at the next `beamline resume`" if every is None else f"one every {hms_text(every)}"
         late = every is not None and longest > every
         more = f"; a state takes {hms_text(longest)}, so the next one begins later than planned" if late else ""
         return (
-            f"{len(self.states)}, one scan like this of each, {when}: {hms_text(self.needs.duration)} and "
+            f"{len(self.states)}, each is scanned like this, {when}: {hms_text(self.needs.duration)} and "
             f"{size(self.needs.total_bytes)} in total{more}"
         )
 

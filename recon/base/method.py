@@ -49,8 +49,8 @@ class Progress:
             latest steps used.
         n_gaussians, n_views: number of Gaussians in the model and of projections in the data.
         held_out: ||rendered - measured|| / ||measured|| of the held-out projections; NaN if there are none.
-        unit: what `step` counts in a direct method, or in a part of the work, such as "slices". If `unit` is empty,
-            `step` counts fitting steps or iterations. If `unit` is not empty, loss and residual are NaN.
+        unit: what `step` counts. It is empty for fitting steps and iterations. Otherwise it is the unit of a direct
+            method or of other work, such as "slices", and loss and residual are NaN.
     """
 
     step: int

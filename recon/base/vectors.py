@@ -44,8 +44,8 @@ def geometry_of_vectors(vectors: ArrayLike, detector_shape: tuple[int, int], *, 
             (with either sign).
 
     Raises:
-        ValueError: the vectors are not finite [view, 12], or the vectors of a projection do not describe a detector
-            with square pixels, as above, within `TOLERANCE`.
+        ValueError: the vectors have another shape, or are not finite. Or the vectors of a projection do not describe a
+            detector with square pixels (tolerance: `TOLERANCE`).
     """
     check_arguments(geometry_of_vectors, locals())
     given = np.asarray(vectors, np.float64)

@@ -31,8 +31,8 @@ class Gaussians:
         log_scales: [n, 3], logarithms of standard deviations in mm along the Gaussian's own axes.
         quaternions: [n, 4] (w, x, y, z), rotations; their length need not be 1, but must not be 0.
         raw_densities: [n]; ρ = density_unit * softplus(raw), so a density is never negative.
-        density_unit: a typical density in 1/mm. Raw densities describe multiples of this density. Therefore raw
-            densities and their learning rates are the same in any unit of length.
+        density_unit: a typical density in 1/mm. A density is a multiple of this unit, and its raw density
+            sets only the multiple. Therefore raw densities and their learning rates are the same in any unit of length.
         kernel: radial profile f.
     """
 

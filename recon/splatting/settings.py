@@ -203,10 +203,10 @@ class FitSettings:
             walnut by 0.2 dB (60 projections) and the battery by 0.4 dB (90 projections).
         rates: learning rates at the first step: of centres (in units of half the width of the field), log scales,
             quaternions and raw densities.
-        pace: factor on all rates. The published rates are for 30 000 steps; a fit of 1000 steps with the published
-            rates is far from convergence. With rates 20 times as high, two projections per step and a low last rate, a
-            fit of 1000 steps gains 1 to 4 dB. With rates 26 times as high and a higher last rate, 400 steps before the
-            voxel refinement are as good as 500 steps with rates 20 times as high.
+        pace: factor on all published rates. These are for 30 000 steps, and 1000 steps with them are far from
+            convergence. With a factor of 20, two projections per step and a low last rate, 1000 steps gain 1 to 4 dB.
+            With a factor of 26, the last rate is higher than with 20. Then 400 steps before the voxel refinement are
+            enough; with a factor of 20, the same volume needs 500 steps.
         paced_for: largest number of steps for which `pace` is used unchanged, see `in_steps`.
         decay: last rate / first rate; in between, the logarithm of the rate falls linearly.
         policy: density control; None: the number of Gaussians stays the same.

@@ -54,9 +54,9 @@ class PosesOfFile:
         "Displacement, roll and tilt of each projection; no projection is resampled. FILE is one of these. (1) "
         "A CSV with the columns view or angle_deg, and shift_col_px, shift_row_px, roll_deg, tilt_deg. (2) A "
         "volume that has poses. (3) An NXtomo file as FILE:x,-y, where x means that a positive x_translation "
-        "shifts the sample towards higher columns, and -y that a positive y_translation shifts it towards lower "
-        "rows. (4) Vectors of each projection in mm, as ASTRA has them: a CSV with ray_x (of a cone: src_x) to "
-        "v_z, or an .npz with parallel3d_vec or cone_vec. ignore: do not use the shifts that a .txrm states.",
+        "shifts the sample towards higher columns, and -y means that a positive y_translation shifts the sample "
+        "towards lower rows. (4) The vectors of ASTRA for each projection, in mm: a CSV with the twelve columns "
+        "ray_x (in a cone beam src_x) to v_z, or an .npz with parallel3d_vec or cone_vec. ignore: do not use the shifts that a .txrm states.",
         parse=_table,
         metavar="FILE",
     )

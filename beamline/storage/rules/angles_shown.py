@@ -339,9 +339,9 @@ def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Finding | No
         "warning",
         ORDER,
         f"{_stated(seen, (int(some[first]), int(some[like[first]])))} look more similar than neighbours "
-        f"do, and so do {odd.sum()} of {some.size} projections that were compared. Unless the sample is "
-        "symmetric, the angles are not in the order of the frames, or the sample rotated further than "
-        "they state.",
+        f"do. {odd.sum()} of the {some.size} compared projections have such a distant twin. If the sample is not "
+        "symmetric, either the angles are not in the order of the frames, or the sample rotated further than the "
+        "angles state.",
     )
 
 

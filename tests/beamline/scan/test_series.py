@@ -115,7 +115,7 @@ def test_the_plan_counts_all_states_and_the_time_between_them(config: Path, tmp_
     assert [each["state"] for each in all_["states"]] == [1, 2, 3] and one["states"] == []
     assert sum(each["total_bytes"] for each in all_["states"]) == STATES * one["total_bytes"]
     told = beamline("scan", config, "--dry-run", "-o", tmp_path / "none")
-    assert "states    3, one scan like this of each, one every 0:00:40" in told.stdout, told.stdout
+    assert "states    3, each is scanned like this, one every 0:00:40" in told.stdout, told.stdout
     assert not (tmp_path / "none").exists()
     needs = dry_run(load(config)).needs
     *_, last = (each["duration"] for each in all_["states"])
