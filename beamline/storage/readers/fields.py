@@ -214,7 +214,8 @@ NXTOMO: tuple[Entry, ...] = (
     Entry("detector/y_flipped", "frames are mirrored top to bottom when they are read"),
     Entry(
         "detector/transformations",
-        "if an axis is rotated by 180° (relative to `gravity`), the frames are mirrored; a warning names other rotations",
+        "if an axis is rotated by 180° (relative to `gravity`), the frames are mirrored; a warning names other "
+        "rotations",
     ),
     Entry(
         "sample/rotation_angle", "angle of each frame, in its `units`; without units the command stops with an error"
