@@ -56,7 +56,8 @@ class PosesOfFile:
         "volume that has poses. (3) An NXtomo file as FILE:x,-y, where x means that a positive x_translation "
         "shifts the sample towards higher columns, and -y means that a positive y_translation shifts the sample "
         "towards lower rows. (4) The vectors of ASTRA for each projection, in mm: a CSV with the twelve columns "
-        "ray_x (in a cone beam src_x) to v_z, or an .npz with parallel3d_vec or cone_vec. ignore: do not use the shifts that a .txrm states.",
+        "ray_x (in a cone beam src_x) to v_z, or an .npz with parallel3d_vec or cone_vec. ignore: do not use the "
+        "shifts that a .txrm states.",
         parse=_table,
         metavar="FILE",
     )
