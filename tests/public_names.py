@@ -48,7 +48,7 @@ FOR_PACKAGES = {
     "beamline.core.sinks": ("Note",),
     "beamline.core.stop": ("ScanAborted", "StopRequest", "stop_signals"),
     "beamline.config.beam": ("NoBeamMonitor",),
-    "beamline.config.load": ("load_as", "resolved_yaml"),
+    "beamline.config.load": ("load_as", "override_of", "resolved_yaml"),
     "beamline.config.models": (
         "Config", "Degrees", "Fields", "OpticsSection", "ReconSection", "SampleSection", "Seconds", "StorageSection",
         "TargetSection", "Views",

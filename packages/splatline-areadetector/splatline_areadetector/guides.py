@@ -40,10 +40,8 @@ _WORDS = {
     **LOCATIONS, "darkfield": FrameKind.DARK, "flatfield": FrameKind.FLAT, "projection": FrameKind.PROJECTION,
     "dark": FrameKind.DARK, "flat": FrameKind.FLAT, "white": FrameKind.FLAT,
 }  # fmt: skip
-EXPOSURE = (
-    "AcquireTime"
-    """Attribute with the exposure time of a frame, s."""
-)
+EXPOSURE = "AcquireTime"
+"""Attribute with the exposure time of a frame, s."""
 _VIEWS = FrameKind.PROJECTION
 _BEFORE, _AFTER = (Place.START, Place.BOTH), (Place.END, Place.BOTH)
 _POLL = 0.1  # s between two reads of a growing file

@@ -174,7 +174,9 @@ print(json.dumps({{"event": "done", "time": 2.0, "output": sys.argv[2], "axis_co
 
     def wait() -> None:
         wait_until(
-            lambda: "recon_done" in said or any("again" not in text for text in said if "reconstruction ended" in text)
+            lambda: (
+                "recon_done" in said or any("is started" not in text for text in said if "reconstruction ended" in text)
+            )
         )
 
     said: list[str] = []
