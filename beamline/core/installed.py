@@ -61,7 +61,9 @@ def package_problem(home: str) -> str:
         if origin is None:
             return f"splatline is incomplete: Python finds no package {name!r}. {_AGAIN}."
         if origin != ours and os.path.realpath(origin) != os.path.realpath(ours):
-            return f"Python finds {name!r} at {origin} instead of that of splatline at {ours}: {_way_out(origin)}."
+            return (
+                f"Python finds {name!r} at {origin} instead of the module of splatline at {ours}: {_way_out(origin)}."
+            )
         with open(origin, "rb") as file:  # noqa: PTH123
             if _MARK not in file.readline():
                 return f"{origin} is not splatline's: {_way_out(origin)}."

@@ -222,7 +222,7 @@ class PnpDct(VoxelMethod):
     FISTA-TV volume, unless a first volume is given. Memory: as for `FistaTv`.
 
     Attributes:
-        iterations: steps towards the projections, five for each threshold.
+        iterations: number of steps that fit the volume to the projections; five of them are made with each threshold.
         patch_threshold: threshold of the last round, in density units. If `patch_threshold` is None, held-out
             projections choose the threshold, see `choose_patches`; if no projection can be held out, the threshold
             follows from the noise.

@@ -350,7 +350,10 @@ class RiddenFrames:
         has_angles = self._plan.angle_source == "attribute"
         if self._sorter.is_by_order and len(self._plan.blocks) > 1:
             off = "" if has_angles else f", and {off}"
-            off = f"the first and last frames of each kind have the wrong kind{off}. Set ride.kinds"
+            off = (
+                "the first and last frames of each block are stored with the kind of the neighbouring block"
+                f"{off}. Set ride.kinds"
+            )
         elif has_angles:
             return ""
         else:

@@ -142,7 +142,10 @@ def measured_structure(
         try:
             thresholds = materials_of(part, count).thresholds
         except ValueError:
-            why = "take more projections or photons: half of the projections show no contrast between the materials"
+            why = (
+                "take more projections or photons: a volume from half of the projections has no contrast between the "
+                "materials"
+            )
             thresholds = materials.thresholds
         moved.append(float(np.abs((thresholds - materials.thresholds) / gaps).max()))
         halves.append(structure_of(part, thresholds, spacing, rules))

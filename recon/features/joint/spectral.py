@@ -56,7 +56,8 @@ class Materials:
         to 1. An example is the state of charge.
 
         Args:
-            least: smallest sum of densities. Voxels with a smaller sum get NaN.
+            least: smallest sum of all densities of a voxel for which a share is computed. Voxels with a smaller sum
+                get NaN.
         """
         part = self.densities[of]
         total = part + self.densities[list(others)].sum(0)
