@@ -39,8 +39,8 @@ class R2(Fit):
         steps: number of steps; 0: the result is the starting point; None: 400 steps, or, if `seconds` is given, as many
             steps as the time allows.
         seconds: time limit of the whole run by the caller's clock: start, steps, voxel refinement and volume. The
-            learning rates decay over this time. This time includes the compilation of kernels, unless `warm_up` was called before.
-            The fit always makes its start and its first step, even if the time is too short.
+            learning rates decay over this time. It includes the compilation of kernels, unless `warm_up`
+            was called before. The fit always makes its start and its first step, even if the time is too short.
         gaussians: number of Gaussians at the start, or the Gaussians to start from; None: a number derived from the
             detector.
         start: volume from which the first Gaussians are sampled, see `initialise.first_volume`.

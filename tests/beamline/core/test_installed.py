@@ -34,7 +34,8 @@ def test_a_script_of_the_user_by_the_name_of_a_package(tmp_path: Path) -> None:
     command = tmp_path / "beamline"
     command.write_text("from beamline.cli.main import run\n", encoding="utf-8")
     told = run(script, tmp_path).stderr.splitlines()[-1]
-    expected = f"Python finds 'recon' at {tmp_path / 'recon.py'} instead of the module of splatline at {ROOT / 'recon/__init__.py'}"
+    ours = ROOT / "recon/__init__.py"
+    expected = f"Python finds 'recon' at {tmp_path / 'recon.py'} instead of the module of splatline at {ours}"
     assert told == f"ImportError: {expected}: rename that file or folder, or work in another folder."
     done = run(command, tmp_path)
     assert (done.stdout, done.stderr, done.returncode) == ("", told.replace("ImportError", "beamline") + "\n", 2)
