@@ -49,8 +49,8 @@ class Discrete(HalfVoxels):
 
     Held-out projections choose the number of levels, their values, and the factor on the FISTA-TV weight μ. The result
     is the FISTA-TV volume if discrete levels do not predict the held-out projections significantly better, if a weaker
-    pull predicts them better, or if there are too few projections to hold any out. If the method starts from a
-    given first volume, it uses total variation alone.
+    pull predicts them better, or if there are too few projections to hold any out and no `levels` are given. If the
+    method starts from a given first volume, it uses total variation alone.
 
     Attributes:
         iterations: largest number of iterations over all projections, not counting the FISTA-TV iterations before them.

@@ -96,6 +96,20 @@ def _at_rows(reference: Volume, trial: Trial) -> Volume:
     return Volume(reference.data, replace(reference.grid, centre=(z - trial.above * pitch, y, x)))
 
 
+def _in_rows(reference: Volume, problem: VoxelProblem) -> Moved | None:
+    """The reference on the voxels of a problem; None: it shows no material there, or ends above or below.
+
+    Raises:
+        ValueError: the reference is beside the volume.
+    """
+    try:
+        return not_moved(reference, problem)
+    except ValueError:
+        _, y, x = reference.grid.centre
+        not_moved(Volume(reference.data, replace(reference.grid, centre=(0.0, y, x))), problem)
+        return None
+
+
 def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerdict:
     """Make the three tests on the rows and projections of a trial. `choice` is the choice of `auto`.
 
@@ -106,11 +120,10 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     if problem.projector.geometry.is_cone:
         return ReferenceVerdict(False, "a reference is used only with a parallel beam, and this is a cone")
     reference = _at_rows(reference, trial)
-    moved = not_moved(reference, problem)
+    moved = _in_rows(reference, problem)
     if mu is None or moved is None:
-        return ReferenceVerdict(
-            False, "the reference shows no material here" if mu else "the weights could not be chosen"
-        )
+        because = "the reference shows no material in the rows of the test" if mu else "the weights could not be chosen"
+        return ReferenceVerdict(False, because)
     mu /= np.sqrt(ONE_IN / (ONE_IN - 1))  # weight for the projections that are not held out, see `choose_weight`
     smooth = trial.volume_of_weight(mu) if trial.smooth is None else trial.smooth
     width, grid = width_of(trial.scan), problem.projector.grid

@@ -83,9 +83,13 @@ class FromReference(Method):
         verdict = ReferenceVerdict.of(decide("reference", lambda: self._asked(choice, trials)))
         if verdict.used and (of_reference := self._from_reference(verdict, problem, control)) is not None:
             return of_reference
+        because = verdict.because
+        if verdict.used:  # the decisions of slabs with the reference are not those of this method
+            control = replace(control, decide=Decisions(problem.seed))
+            because = "the reference shows no material in this part of the volume"
         made = self.otherwise.run_chosen(choice, problem, control)
-        settings = {**made.settings, "reference_used": False, "reference_because": verdict.because}
-        return replace(made, settings=settings, chosen=f"The reference was not used: {verdict.because}. {made.chosen}")
+        settings = {**made.settings, "reference_used": False, "reference_because": because}
+        return replace(made, settings=settings, chosen=f"The reference was not used: {because}. {made.chosen}")
 
     def _asked(self, choice: TrialChoice, trials: list[Trial | None]) -> ReferenceVerdict:
         trial = trials[0] if trials else None
