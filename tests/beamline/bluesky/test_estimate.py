@@ -116,5 +116,5 @@ def test_a_plan_that_cannot_be_followed_has_a_fault(devices: tuple[Any, Any], mo
     said = [" ".join(map(str, scan.faults)) for scan in plan.scans]
     assert "cannot be predicted, because it stops without measured values (TypeError: 'NoneType' object" in said[0]
     assert said[1] == "the plan does not end within 100 messages"
-    assert said[2] == "the plan moves rotation to 1000°, the limits of the stage are -5° ... 365°"
+    assert said[2] == "the plan moves rotation to 1000°, but the limits of the stage are -5° ... 365°"
     assert plan.scans[3].valid
