@@ -269,8 +269,8 @@ with open_scan(SourceOptions(path)) as source:
     chosen = [Selection(axis_col=20.7, steps=(Air("none"), *steps)) for steps in ((), (Lift(0.5),))]
     plain, lifted = (prepare_projections(select(source, each), print) for each in chosen)
 np.testing.assert_allclose(lifted.seen.data, plain.seen.data + 0.5, atol=1e-6)
-assert lifted.done["lift"].sentence == "Lifted by 0.5."
-found = recorded(in_order(chosen[1]), lifted.done)
+assert lifted.origin.done["lift"].sentence == "Lifted by 0.5."
+found = recorded(in_order(chosen[1]), lifted.origin.done)
 assert (found["lift"], found["lift_said"]) == (0.5, "Lifted by 0.5.")
 
 def run(*options):
