@@ -268,7 +268,7 @@ def same_file(first: Path, second: Path) -> bool:
             return probe.with_name(probe.name.swapcase()).exists()
         finally:
             probe.unlink()
-    return False
+    return os.path.normcase(names[0]) == os.path.normcase(names[1])  # no file can be made there
 
 
 def replaceable(path: Path) -> Path:

@@ -4,10 +4,11 @@ A ray through voxels as wide as a pixel is interpolated between two of them. The
 blurred than measured ones (`recon.voxels.resolution`), and one voxel must stand for the sharp edge of a grain. Voxels
 half as wide have a quarter of this blur. The result is the mean of the four small voxels in each voxel.
 
-With 10⁴ photons, packed grains gain 0.8 to 1.1 dB from 30 and 45 projections of 192 columns. The residual in
-projections that were not used falls from 0.0190 to 0.0172 on a measured electrode, and from 0.0049 to 0.0044 on a
-measured walnut. Voxels of bone, cement and thorax gain 0.1 to 0.5 dB. Grains in a can 1.5 and 2 times as wide as the
-field of view gain 0.1 to 0.4 dB with total variation, and 0.5 to 0.8 dB with discrete tomography.
+With 10⁴ photons, packed grains from 30 and 45 projections of 192 columns gain 0.2 to 0.5 dB with total variation, and
+1.1 dB with discrete tomography. The residual in projections that were not used falls from 0.0190 to 0.0172 on a
+measured electrode, and from 0.0049 to 0.0044 on a measured walnut. Smooth volumes gain nothing on average: bone, cement
+and thorax from 24 and 36 projections of 129 columns change by -0.5 to +0.3 dB. Grains in a can 1.5 and 2 times as wide
+as the field of view gain 0.1 to 0.4 dB with total variation, and 0.5 to 0.8 dB with discrete tomography.
 (tests/bench/half_voxels.py)
 """
 
@@ -34,16 +35,17 @@ MethodT = TypeVar("MethodT")
 MakePull = Callable[[VoxelProblem, F32], Pull]
 
 COST, USUAL_FURTHER = 3, 30
-"""Time of an iteration on half voxels, divided by that of an iteration on whole voxels (2.6 to 4), and usual number of
-iterations on half voxels.
+"""Time of an iteration on half voxels, divided by that of an iteration on whole voxels (2.5 to 4.5 for 16 rows, up to
+6.6 for 8 rows), and usual number of iterations on half voxels.
 """
 _DUAL_STEPS = 8
 """Factor on the dual steps of each proximal step.
 
-Total variation reaches twice as many half voxels as whole ones. With the factor 1, the errors of the proximal steps
-accumulate in scans with heavy weights: a cathode from 45 projections of 512 columns had 21.9 dB and had not converged
-after 60 iterations. With 4 it has 23.9 dB, with 8 it has 24.1 dB after 25 iterations. Elsewhere the factor changes the
-volume by up to 0.05 dB, and the time by less than a tenth, because fewer iterations are needed.
+The smoothing of total variation must cross twice as many half voxels as whole ones. With the factor 1, the errors of
+the proximal steps accumulate if the weight is heavy: a cathode from 45 projections of 512 columns had 21.9 dB and had
+not converged after 60 iterations. With 4 it has 23.9 dB, with 8 it has 24.1 dB after 25 iterations. In eight scans of
+192 columns, the factor 8 changes the volume by up to 0.07 dB and takes 2 to 20 % more time. With 8 rows it takes up to
+a third more.
 """
 _FEW, _MOST_COLUMNS, _WIDEST, _LEAST_WIDTH, _AS_WIDE = 1 / 3, 1024, 2.2, 0.75, 0.1
 # copies of half-voxel volumes: a quarter for the volume of whole voxels, the rest for the coarse cells of damping
@@ -112,7 +114,7 @@ class HalfVoxels(VoxelMethod):
         if not self.halves(projector.geometry, projector.grid):
             return x
         before = 0 if decide.ended is None else decide.ended.after
-        fine, start = _with_half_voxels(problem, first + before), in_halves(in_halves(x, 0), 1)
+        fine, start = _with_half_voxels(problem, first + before), np.repeat(np.repeat(x, 2, axis=0), 2, axis=1)
         on_halves = ordered_fista(
             fine, start, TvWeight(mu / 2), subsets_on_halves(fine), sweeps=self.iterations,
             prox=tv_prox(fine, _DUAL_STEPS * tv_steps), pull=None if pull is None else pull(fine, start),
@@ -134,10 +136,11 @@ def with_halves(method: MethodT, wanted: bool) -> MethodT:
 def uses_half_voxels(wanted: bool | None, geometry: Geometry, grid: Grid) -> bool:
     """Whether the last iterations use voxels of half a pixel.
 
-    None: only for a parallel beam with fewer projections than a third of the columns, because an iteration over more
-    projections takes long. (With 90 projections of 128 columns total variation would gain 0.3 dB.) Voxels must be as
-    wide as
-    pixels: with voxels of 0.8 and 1.5 pixels, errors grew by 2 to 11 %. The grid may have up to 1024 columns, because
+    None: only for a parallel beam with fewer projections than a third of the columns. With more projections, packed
+    grains would still gain 0.4 to 0.9 dB (up to half of the columns), but an iteration takes long, and other samples
+    lose: thorax and bone from 50 projections of 129 columns 0.6 and 0.1 dB, and measured Diamond 0.2 dB in projections
+    that were not used. Voxels must be as wide as pixels: with voxels of 0.8 and 1.5 pixels, errors grew by 2 to 11 %.
+    The grid may have up to 1024 columns, because
     half voxels need four times the memory. It may be up to 2.2 times as wide as the field of view: with a sample three
     times as wide, the share of wrong voxels grew from 17 to 19 %.
 
@@ -164,19 +167,6 @@ def halved(grid: Grid) -> Grid:
     """The grid with voxels half as wide along y and x, and with the same slices."""
     nz, ny, nx = grid.shape
     return Grid((nz, 2 * ny, 2 * nx), grid.voxel_size / 2, grid.centre, grid.spacing[0])
-
-
-def in_halves(x: F32, axis: int) -> F32:
-    """The volume x with voxels half as wide along this axis, by linear interpolation.
-
-    Half voxels start from it. It is smoother than the same value in both halves, which needs 4 more iterations of about
-    30.
-    """
-    lines = np.moveaxis(x, axis, 0)
-    padded = np.concatenate([lines[:1], lines, lines[-1:]])
-    further = (padded[2:] - padded[:-2]) / 8  # slope (a central difference) times a quarter of a voxel
-    made = np.stack([lines - further, lines + further], axis=1).reshape(2 * len(lines), *lines.shape[1:])
-    return np.ascontiguousarray(np.moveaxis(made, 0, axis))
 
 
 def _with_half_voxels(problem: VoxelProblem, done: int) -> VoxelProblem:

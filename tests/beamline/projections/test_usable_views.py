@@ -39,7 +39,8 @@ def test_what_is_left_out_and_what_weighs_half_is_told_in_a_line(tmp_path: Path)
     np.testing.assert_array_equal(found.ids, used)
     np.testing.assert_allclose(found.geometry.angles, SCAN.angles[np.array(used) - FIRST], atol=1e-9)
     np.testing.assert_allclose(found.seen.data, SCAN.line_integrals()[np.array(used) - FIRST], atol=1e-4)
-    weights = {row: w for row, w in zip(used, found.sources.of_views.tolist(), strict=True) if w != 1}  # type: ignore[union-attr]
+    assert found.sources.of_views is not None
+    weights = {row: w for row, w in zip(used, found.sources.of_views.tolist(), strict=True) if w != 1}
     assert weights == {FIRST + 3: WARNED_WEIGHT, FIRST + 20: WARNED_WEIGHT}
     assert found.views.weights[...].shape == (24, 2, 40)
     rays = hold_out(found, 8, advice="").views.weights[...]

@@ -18,7 +18,7 @@ from recon.base.volume import Grid
 from recon.error_bars import error_bars_memory
 from recon.kernels.cpu.tv import total_variation
 from recon.voxels.choice import TrialChoice
-from recon.voxels.half_voxels import COST, HalfVoxels, halved, in_halves, uses_half_voxels, with_halves
+from recon.voxels.half_voxels import COST, HalfVoxels, halved, uses_half_voxels, with_halves
 from recon.voxels.iterative import scaled_problem
 from recon.voxels.projector import Projector
 from recon.voxels.trial import Trial
@@ -247,11 +247,3 @@ def test_by_default_only_in_voxels_as_wide_as_pixels(width: float, used: bool) -
     geometry = geometry_of(12)
     grid = replace(Grid.matching(geometry), voxel_size=width)
     assert uses_half_voxels(None, geometry, grid) is used
-
-
-def test_half_voxels_start_from_a_linear_interpolation() -> None:
-    ramp = np.add.outer(3.0 * np.arange(6), 2.0 * np.arange(5) + 4)[:, :, None].astype(np.float32)
-    fine = in_halves(in_halves(ramp, 0), 1)
-    y, x = (np.arange(12) - 0.5) / 2, (np.arange(10) - 0.5) / 2
-    np.testing.assert_allclose(fine[2:-2, 2:-2, 0], np.add.outer(3 * y, 2 * x + 4)[2:-2, 2:-2], rtol=1e-6)
-    np.testing.assert_allclose(fine.reshape(6, 2, 5, 2, 1).mean((1, 3)), ramp, rtol=1e-6)
