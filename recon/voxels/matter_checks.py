@@ -247,7 +247,9 @@ def unexplained_memory(geometry: Geometry) -> int:
     n, views, cols = _rows_looked_at(geometry), geometry.n_views, geometry.detector_shape[1]
     slices = (1 + _FLIPS) * n
     gridded = is_gridded(replace(geometry, detector_shape=(slices, cols)), Grid((slices, cols, cols)), "hann")
-    return 4 * n * cols * (13 * cols + 17 * views) + (fbp_memory(views, cols) if gridded else 80 * views * cols)
+    # the residual is computed before the volumes, or the volumes are larger
+    largest = max(19 * views, 13 * cols + 8 * views)
+    return 4 * n * cols * largest + (fbp_memory(views, cols) if gridded else 80 * views * cols)
 
 
 def _rows_looked_at(geometry: Geometry) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from recon.base.geometry import Geometry
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
-from recon.voxels.matter_checks import UNEXPLAINED_LIMIT, Unexplained, unexplained
+from recon.voxels.matter_checks import UNEXPLAINED_LIMIT, Unexplained, unexplained, unexplained_memory
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
@@ -82,3 +83,21 @@ def test_what_it_is_not_made_for(rng: np.random.Generator) -> None:
     assert _unexplained(Volume(np.zeros_like(TRUTH), GRID), Views(data, VIEWS), rng) is None
     cone = Geometry.cone(VIEWS.angles, (8, 64), 1.0, 500.0, 700.0)
     assert _unexplained(volume, Views(data, cone), rng) is None
+
+
+@pytest.mark.parametrize(
+    ("views", "rows", "columns"), [(60, 200, 48), (360, 64, 96), (600, 32, 64), (40, 64, 64), (91, 16, 256)]
+)
+def test_the_stated_memory_is_that_of_the_peak(views: int, rows: int, columns: int, rng: np.random.Generator) -> None:
+    geometry = Geometry.parallel(np.linspace(0, math.pi, views, endpoint=False), (rows, columns))
+    grid = Grid.matching(geometry)
+    _, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    cylinder = Volume((np.hypot(x, y) < 0.4 * columns).astype(np.float32), grid)
+    noise = rng.normal(0, 0.5, (views, rows, columns)).astype(np.float32)
+    measured = Views(Projector(geometry, grid).forward(cylinder.data) + noise, geometry)
+    assert _unexplained(cylinder, measured, rng) is not None  # everything is compiled
+    tracemalloc.start()
+    _unexplained(cylinder, measured, rng)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < unexplained_memory(geometry) < 1.6 * peak
