@@ -191,13 +191,18 @@ def _better_displaced(trial: Trial, fit: StateFit) -> str | None:
     """The direction in which a copy of the reference, displaced by a voxel, predicts as well as the reference itself;
     None: there is no such direction.
     """
+
+    def displaced(axis: int, step: int) -> F64:
+        """The residuals with this copy. A function, because it frees the copy before the next one is made."""
+        u = fit.moved.u.copy()
+        u[axis] += step
+        copy = fit.again(fit.weight, fit.x, replace(fit.moved, u=u))
+        copy.solve(most=_FEW)
+        return trial.residuals(copy.x)
+
     own = trial.residuals(fit.x)
     for axis in range(2 if fit.moved.u[2].any() == 0 else 3):
         for step in (-1, 1):
-            u = fit.moved.u.copy()
-            u[axis] += step
-            copy = fit.again(fit.weight, fit.x, replace(fit.moved, u=u))
-            copy.solve(most=_FEW)
-            if not exceeds_standard_error(trial.residuals(copy.x) - own, 1.0):
+            if not exceeds_standard_error(displaced(axis, step) - own, 1.0):
                 return f"along {'yxz'[axis]}"
     return None

@@ -16,10 +16,10 @@ from recon.base.geometry import Geometry
 from recon.base.method import Method, Preview, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
-from recon.features.reference.choice import ReferenceVerdict, about_reference, asked, not_moved, width_of
+from recon.features.reference.choice import MARGIN, ReferenceVerdict, about_reference, asked, not_moved, width_of
 from recon.features.reference.fit import PLAN, StateFit
 from recon.features.reference.motion import KNOTS, Basis, padded
-from recon.features.reference.particles import require_finite
+from recon.features.reference.particles import bytes_placed, require_finite
 from recon.features.reference.preview import preview_of
 from recon.voxels.choice import TrialChoice
 from recon.voxels.iterative import solve_views, watched
@@ -30,7 +30,10 @@ from recon.voxels.voxel_problem import Buffers, VoxelProblem, bytes_of, times_po
 _ROUNDS = PLAN[2:]
 # largest number of iterations of a round; rounds with falling weights, and iterations of each
 _FIRST, _SHARPER, _LAST = 8, 2, 12
-_BUFFERS = Buffers(34.0, 3.0, 4.8, filtered=True)
+_AT_FIRST = Buffers(8.0, 3.0, 3.5)  # when the reference is put on the voxels
+# Peaks measured, in volumes: 54 in a slab of 16 rows, with 48 rows of the reference; 42 in 64 rows that all of the
+# reference is in.
+_BUFFERS, _PLACED = Buffers(40.0, 7.0, 3.5, filtered=True), 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +46,8 @@ class FromReference(Method):
     Held-out projections decide whether the reference is used. If it is not used, or if there are fewer than 16
     projections, the volume is exactly the volume of the method `otherwise`.
 
-    Memory: 34 volumes, 3 times the projections and the reference.
+    Memory: the reference, 40 volumes, 7 times the projections, and 5 times the part of the reference that is used: up
+    to 16 voxels beyond the volume on each side.
 
     Attributes:
         reference: the earlier volume, in 1/mm, in the coordinates of its own scan; None: there is no reference.
@@ -150,8 +154,11 @@ class FromReference(Method):
         return replace(self, otherwise=self.otherwise.toy())
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        own = 0 if self.reference is None else self.reference.data.nbytes
-        return own + max(bytes_of(_BUFFERS, geometry, grid, weighted), self.otherwise.memory(geometry, grid, weighted))
+        own, given = (0, None) if self.reference is None else (self.reference.data.nbytes, self.reference.grid)
+        placed, smoothed = bytes_placed(given, grid, MARGIN)
+        at_first = bytes_of(_AT_FIRST, geometry, grid, weighted) + placed + smoothed
+        later = bytes_of(_BUFFERS, geometry, grid, weighted) + _PLACED * placed
+        return own + max(at_first, later, self.otherwise.memory(geometry, grid, weighted))
 
 
 class _State:

@@ -4,6 +4,7 @@ each voxel.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ _HULL = 8  # voxels by which gaps are closed, to find the material between parti
 _NEAR = 4  # voxels around a particle that count as part of the particle
 # smallest number of voxels from which the ground is measured; with fewer voxels, air is assumed between particles
 _LEAST_GROUND = 100
+_COARSER = 1.5  # size of a voxel, divided by that of the reference, above which it gets a mean of the reference
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,46 +54,95 @@ def particles_of(volume: F32) -> Particles | None:
 
     Two levels are separated by Otsu's threshold (1979, IEEE Trans. Syst. Man Cybern. 9, 62). The ground is the median
     of the voxels below the threshold that are enclosed by solid voxels. A particle is the set of solid voxels from
-    which steepest ascent of the smoothed distance from the surface leads to the same summit.
+    which steepest ascent of the smoothed distance from the surface leads to the same summit. Memory: 9 volumes.
     """
     v = np.maximum(volume, 0)
+    split = _threshold(v)
+    if split is None:
+        return None
+    solid = v > split
+    base = _ground(v, solid, split)
+    level = float(np.median(v[solid])) - base
+    label = _widened(summits(ndi.gaussian_filter(_to_nearest(solid)[0], 1.0), solid))
+    return Particles(np.minimum(v, np.float32(base)), np.maximum(v - np.float32(base), 0), label, base, level)
+
+
+def _threshold(v: F32) -> float | None:
+    """Otsu's threshold of the voxels with material; None: there are no two levels."""
     seen = v[v > 0.1 * np.percentile(v, 99)] if v.any() else v[:0]
     if seen.size < 2 or seen.min() == seen.max():
         return None
     counts, edges = np.histogram(seen, 200)
     levels, w = (edges[1:] + edges[:-1]) / 2, np.cumsum(counts)
     mean = np.cumsum(counts * levels)
-    split = levels[np.argmax((mean[-1] * w / w[-1] - mean) ** 2 / np.maximum(w * (w[-1] - w), 1))]
-    solid, cross, wide = v > split, ndi.generate_binary_structure(2, 1)[..., None], _HULL + 4
+    return levels[np.argmax((mean[-1] * w / w[-1] - mean) ** 2 / np.maximum(w * (w[-1] - w), 1))]
+
+
+def _ground(v: F32, solid: NDArray[np.bool_], split: float) -> float:
+    """The level between particles; 0 if too few voxels show it."""
+    cross, wide = ndi.generate_binary_structure(2, 1)[..., None], _HULL + 4
     rim = ((wide, wide), (wide, wide), (0, 0))
     hull = ndi.binary_closing(np.pad(solid, rim), cross, iterations=_HULL)[wide:-wide, wide:-wide]
     low = v[hull & (v < 0.8 * split)]
-    base = float(np.median(low)) if low.size > _LEAST_GROUND else 0.0
-    level = float(np.median(v[solid])) - base
-    depth = ndi.distance_transform_edt(solid).astype(np.float32)
-    label = summits(ndi.gaussian_filter(depth, 1.0), solid)
-    away, near = ndi.distance_transform_edt(label == 0, return_indices=True)
-    label = np.where(away < _NEAR, label[tuple(near)], 0).astype(np.int32)
-    return Particles(np.minimum(v, np.float32(base)), np.maximum(v - np.float32(base), 0), label, base, level)
+    return float(np.median(low)) if low.size > _LEAST_GROUND else 0.0
+
+
+def _widened(label: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The labels, also of voxels within `_NEAR` of a particle: these get the label of the nearest particle."""
+    away, near = _to_nearest(label == 0)
+    wide = np.zeros_like(label)
+    for row, places in enumerate(near.swapaxes(0, 1)):
+        wide[row] = np.where(away[row] < _NEAR, label[tuple(places)], 0)
+    return wide
+
+
+def _to_nearest(mask: NDArray[np.bool_]) -> tuple[F32, NDArray[np.int32]]:
+    """Distance in voxels [y, x, z] from each voxel to the nearest voxel outside `mask`, and the place of this voxel
+    [3, y, x, z].
+
+    The distances of `ndi.distance_transform_edt` need 12 volumes while they are computed; these need 6.
+    """
+    near = ndi.distance_transform_edt(mask, return_distances=False, return_indices=True)
+    squared = np.zeros(mask.shape, np.float32)
+    for axis, n in enumerate(mask.shape):
+        own = np.arange(n, dtype=np.int32).reshape([-1 if a == axis else 1 for a in range(3)])
+        squared += np.square((near[axis] - own).astype(np.float32))
+    return np.sqrt(squared, out=squared), near
 
 
 def summits(depth: F32, solid: NDArray[np.bool_]) -> NDArray[np.int32]:
     """[y, x, z] numbers from 1: each solid voxel gets the number of the summit of `depth` to which steepest ascent
     leads. 0 elsewhere.
     """
-    apart = depth + 1e-6 * np.arange(depth.size).reshape(depth.shape) / depth.size  # no two voxels have the same depth
-    uphill, best = np.arange(depth.size).reshape(depth.shape), apart.copy()
-    box, index = np.pad(apart, 1), np.pad(uphill, 1)
-    for corner in np.ndindex(3, 3, 3):
-        part = tuple(slice(o, o + n) for o, n in zip(corner, depth.shape, strict=True))
-        better = box[part] > best
-        best[better], uphill[better] = box[part][better], index[part][better]
-    flat = uphill.ravel()
-    while not np.array_equal(flat, flat[flat]):
-        flat = flat[flat]
-    label = np.zeros(depth.shape, np.int32)
-    label[solid] = np.unique(flat.reshape(depth.shape)[solid], return_inverse=True)[1] + 1
+    size, (ny, nx, nz) = depth.size, depth.shape
+    box, flat = np.full((ny + 2, nx + 2, nz + 2), -math.inf), np.arange(size)
+    uphill = flat.reshape(depth.shape)
+    for row in range(ny):  # no two voxels have the same depth
+        box[row + 1, 1:-1, 1:-1] = depth[row] + 1e-6 * uphill[row] / size
+    for row in range(ny):
+        own, best = uphill[row].copy(), box[row + 1, 1:-1, 1:-1].copy()
+        for y, x, z in np.ndindex(3, 3, 3):
+            beside = box[row + y, x : x + nx, z : z + nz]
+            better = beside > best
+            best[better], uphill[row][better] = beside[better], own[better] + ((y - 1) * nx + x - 1) * nz + z - 1
+    del box
+    while sum(_climb(row, flat) for row in uphill):
+        pass
+    is_summit = np.zeros(size, bool)
+    for places, inside in zip(uphill, solid, strict=True):
+        is_summit[places[inside]] = True
+    number, label = np.cumsum(is_summit, dtype=np.int32), np.zeros(depth.shape, np.int32)
+    for own, places, inside in zip(label, uphill, solid, strict=True):
+        own[inside] = number[places[inside]]
     return label
+
+
+def _climb(places: NDArray[np.intp], uphill: NDArray[np.intp]) -> bool:
+    """Move places on to where they lead; False if all of them are summits."""
+    further = uphill[places]
+    moved = not np.array_equal(places, further)
+    places[...] = further
+    return moved
 
 
 def require_finite(reference: Volume) -> None:
@@ -105,6 +156,24 @@ def require_finite(reference: Volume) -> None:
             f"{wrong} of {voxels.size} voxels of the reference are not finite, but each must be an attenuation in "
             "1/mm; write 0 in places without material, and interpolate in places with material"
         )
+
+
+def bytes_placed(reference: Grid | None, grid: Grid, margin: int) -> tuple[int, int]:
+    """Largest size in bytes of the result of `placed` at any height of the grid, and of the smoothed copy of a part of
+    the reference that `placed` makes if the voxels of the grid are coarser.
+
+    None: a reference that is as wide as the grid and at least as high as the result, with the same voxels.
+    """
+    nz, ny, nx = grid.shape
+    if reference is None:
+        return 4 * (nz + 2 * margin) * ny * nx, 0
+    extents = zip(reference.shape, reference.spacing, grid.shape, grid.spacing, strict=True)
+    size = 4 * math.prod(
+        min(n + 2 * margin, math.floor((own - 1) * pitch / edge + 0.02) + 1) for own, pitch, n, edge in extents
+    )
+    ratios = [edge / pitch for edge, pitch in zip(grid.spacing, reference.spacing, strict=True)]
+    smoothed = min(math.ceil(size * math.prod(ratios)), 4 * math.prod(reference.shape))
+    return size, smoothed if max(ratios) > _COARSER else 0
 
 
 def placed(reference: Volume, grid: Grid, margin: int) -> tuple[F32, tuple[int, int, int]]:
@@ -136,7 +205,7 @@ def placed(reference: Volume, grid: Grid, margin: int) -> tuple[F32, tuple[int, 
         first = np.rint(offset).astype(int)
         part = data[tuple(slice(f, f + n) for f, n in zip(first, high - low + 1, strict=True))]
     else:
-        if ratio.max() > 1.5:  # coarser voxels are means; a window of even size begins half a voxel early
+        if ratio.max() > _COARSER:  # coarser voxels are means; a window of even size begins half a voxel early
             wide = np.maximum(np.rint(ratio), 1).astype(int)
             data, offset = ndi.uniform_filter(data, wide, mode="nearest"), offset + (wide % 2 == 0) / 2
         part = ndi.affine_transform(data, ratio, offset, tuple(high - low + 1), order=1, mode="nearest")

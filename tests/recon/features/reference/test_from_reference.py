@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +11,11 @@ import pytest
 import recon
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
-from recon.base.method import DataUse, RunControl
-from recon.base.volume import Volume
+from recon.base.method import DataUse, ReconProblem, RunControl
+from recon.base.view_data import Views
+from recon.base.volume import Grid, Volume
 from tests.recon.features.reference.scene import LEVEL, ROWS, Discs, N, balls_near_one_end, packed, psnr, scanned
+from tests.slow_cases import others_slow
 
 AUTO = recon.Auto((recon.Fbp(), recon.FistaTv()))
 BEFORE = packed()
@@ -104,6 +107,32 @@ def test_weights_of_rays_are_used(before: Volume, state: tuple[F32, recon.Geomet
     assert psnr(made.volume.data, STATE.volume) > psnr(
         recon.reconstruct(data, geometry, AUTO).volume.data, STATE.volume
     )
+
+
+@pytest.mark.parametrize(
+    "rows, beyond, weighted", others_slow([(16, 16, False), (16, 16, True), (64, 16, False), (64, 16, True)], 1)
+)
+def test_the_stated_memory_is_at_least_the_peak_of_a_slab(
+    rows: int, beyond: int, weighted: bool, before: Volume, state: tuple[F32, recon.Geometry]
+) -> None:
+    """A slab, with rows of the reference beyond it. The first slab makes the tests, the others do not."""
+    data, geometry = state
+    shape = rows, N
+    slab = replace(geometry, detector_shape=shape, axis_row=(rows - 1) / 2)
+    tall = np.tile(before.data, (rows // ROWS + 2 * beyond // ROWS, 1, 1))
+    method = recon.FromReference(Volume(tall, Grid(tall.shape, before.grid.voxel_size)), AUTO)
+    weights = np.ones((len(data), *shape), np.float32) if weighted else None
+    problem = ReconProblem(Views(np.tile(data, (1, rows // ROWS, 1)), slab, weights), Grid.matching(slab))
+    method.run(problem, RunControl())  # loads kernels
+    stated = method.memory(slab, problem.grid, weighted) - tall.nbytes  # the reference is there before
+    first = Decisions()
+    for decide in (first, Decisions(0, first.made)):
+        tracemalloc.start()
+        made = method.run(problem, RunControl(decide=decide))
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert made.settings["reference_used"], made.chosen
+        assert peak < stated < 1.5 * peak
 
 
 def test_it_stops_when_it_is_asked_to(before: Volume, state: tuple[F32, recon.Geometry]) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
 from recon.base.volume import Grid, Volume
-from recon.features.reference.particles import particles_of, placed, summits
+from recon.features.reference.particles import bytes_placed, particles_of, placed, summits
 from tests.recon.features.reference.scene import LEVEL, ROWS, N, packed
 
 
@@ -47,6 +49,21 @@ def test_a_reference_is_put_on_the_voxels_of_a_state(rng: np.random.Generator) -
     np.testing.assert_array_equal(rows, data[1:5].transpose(1, 2, 0))
     wide, first = placed(reference, Grid((6, 12, 12), 0.5), 0)
     assert first == (-2, -2, 0) and wide.shape == (8, 8, 6)
+
+
+@pytest.mark.parametrize("edge", [0.5, 0.7, 2.0])
+def test_the_stated_memory_is_that_of_a_reference_on_the_voxels_of_a_state(
+    edge: float, rng: np.random.Generator
+) -> None:
+    reference = Volume(rng.random((96, 128, 128), np.float32), Grid((96, 128, 128), 0.5))
+    grid = Grid((round(24 / edge), round(56 / edge), round(56 / edge)), edge)
+    tracemalloc.start()
+    volume = placed(reference, grid, 4)[0]
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    size, smoothed = bytes_placed(reference.grid, grid, 4)
+    assert volume.nbytes <= size < 1.2 * volume.nbytes
+    assert peak < 2.1 * size + 1.1 * smoothed and (smoothed > 0) == (edge > 1)
 
 
 def test_coarser_voxels_have_the_means_of_the_reference() -> None:
