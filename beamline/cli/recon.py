@@ -93,10 +93,10 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
     values, file = dict(context.params), context.params["file"]
     method = _checked_method(context, default)
     path = values["output"] or Path(f"{safe_name(file.stem)}_{method}.h5")
-    for needed in (file, values["reference"]) if there else ():
+    for option, needed in (("", file), ("--reference ", values["reference"])) if there else ():
         if needed is not None and not needed.exists():
             with json_events(values["as_json"]):
-                raise DataError(f"{needed} does not exist.")
+                raise DataError(f"{option}{needed} does not exist.")
     from beamline.reconstruct.checkpoints import CheckpointOptions  # imported here because help does not need it
     from beamline.reconstruct.options import FollowTiming, OutputPaths, ReconOptions, report_beside
 

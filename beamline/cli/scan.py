@@ -79,7 +79,7 @@ class ScanRequest:
     reference: Path | None = set_by(
         "--reference",
         metavar="GOOD",
-        type=click.Path(path_type=Path),
+        type=click.Path(path_type=Path, exists=True),
         help="Volume of the same sample from an earlier, careful scan, or that scan itself. During the scan, the "
         "live picture shows this reference, moved to the present position of the sample, and what has changed. After "
         "the scan, the volume is made with this reference, as with `beamline recon --reference`. The same as "

@@ -111,7 +111,7 @@ def read_config(
 
 def load_as(model: type[AnySection], path: Path, overrides: Iterable[str] = (), *, printed_by: str) -> AnySection:
     """Read and validate the configuration of another package, as `load` does for a scan. Environment variables do not
-    override it.
+    override it. File names in the file are relative to it; those in overrides, to the working directory.
 
     Args:
         printed_by: the command that prints an example.
@@ -120,6 +120,7 @@ def load_as(model: type[AnySection], path: Path, overrides: Iterable[str] = (), 
     tree = _read_file(path, printed_by)
     _locate(tree.data, path.parent)
     tree = override(tree, overrides, {}, lambda keys: takes_text(keys, legal))
+    _locate(tree.data, Path())
     try:
         return model.model_validate(tree.data)
     except ValidationError as error:

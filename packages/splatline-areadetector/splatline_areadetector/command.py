@@ -46,7 +46,7 @@ def _print_example(ctx: click.Context, param: click.Parameter, value: bool) -> N
     "--flats", metavar="FILE", help="Flats for a scan that takes none: a scan file, HDF5 (FILE::DATASET) or TIFF."
 )
 @click.option(
-    "--reference", metavar="GOOD", type=click.Path(path_type=Path),
+    "--reference", metavar="GOOD", type=click.Path(path_type=Path, exists=True),
     help="Volume of the same sample from an earlier, careful scan, or that scan itself; used as by `beamline scan`. "
     "The same as recon.reference in CONFIG.",
 )  # fmt: skip

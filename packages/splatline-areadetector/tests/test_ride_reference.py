@@ -9,12 +9,16 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from fake_ioc import FakeIoc, array_value
 from ridden import RideProgram, config_of, reread, stored
 
+from beamline.config.load import load_as
 from beamline.core.errors import ConfigError
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import opened_volume, write_volume
+from splatline_areadetector.command import ride
+from splatline_areadetector.config import RideConfig
 from tests.recon.features.reference.scene import N, packed, scanned
 
 VIEWS, FIRST = 24, 20  # projections; of these, before the picture is waited for
@@ -60,3 +64,15 @@ def test_the_name_of_a_reference_is_relative_to_the_configuration_and_a_missing_
         reread(path)
     (tmp_path / "good.h5").touch()
     assert reread(path).recon.reference == str((tmp_path / "good.h5").resolve())
+
+
+def test_a_missing_reference_is_named_by_the_option_and_its_path_does_not_depend_on_the_folder_of_the_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config_of(tmp_path, "pva://T:Pva1:Image")
+    done = CliRunner().invoke(ride, [str(tmp_path / "my.yaml"), "--reference", "good.h5"])
+    assert done.exit_code == 2 and "'--reference': Path 'good.h5' does not exist" in done.output
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "good.h5").touch()
+    read = load_as(RideConfig, Path("my.yaml"), ["recon.reference=good.h5"], printed_by="beamline ride --example")
+    assert read.recon.reference == str(tmp_path.resolve() / "good.h5")

@@ -16,6 +16,7 @@ from scipy import ndimage as ndi
 
 import recon
 from beamline.cli.recon import recon as command
+from beamline.config.load import config_folder
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Sink
 from beamline.page.tiles import TileRegion
@@ -149,6 +150,13 @@ def test_what_cannot_be_done_is_refused(options: tuple[str, ...], error: str, fo
     done = beamline("recon", str(folder / "state.h5"), *named, "-o", str(folder / "refused.h5"))
     assert done.exit_code != 0 and error in " ".join(done.output.split())
     assert not (folder / "refused.h5").exists()
+
+
+@pytest.mark.parametrize("words", [("recon", "state.h5"), ("scan", str(config_folder() / "demo.yaml"))])
+def test_a_missing_reference_is_named_with_its_option(words: tuple[str, str], folder: Path) -> None:
+    done = beamline(words[0], str(folder / words[1]), "--reference", str(folder / "none.h5"))
+    assert done.exit_code != 0 and "--reference" in done.output and "none.h5" in done.output
+    assert "does not exist" in done.output and "--set" not in done.output
 
 
 def test_a_reference_with_a_voxel_that_is_not_finite_is_refused(folder: Path) -> None:
