@@ -86,6 +86,16 @@ class MaterialTrial:
         Held-out projections then also contain the sample outside the field of view, and prefer an eighth to a half of
         the weight. For packed balls in a can 1.5, 2 and 3 times as wide as the field, this would cost 0.5, 0.8 and 0.7
         dB. For a can 1.06 times as wide they rightly prefer twice the weight, which gains 1.1 dB.
+
+        If the tests are stopped before the last one, there are no levels, because those so far may still be rejected.
+        """
+        found = self._found()
+        if found is not None and not self._trial.ended:
+            self.best, self.materials = found
+
+    def _found(self) -> tuple[F64, MaterialPrior] | None:
+        """The residuals and the levels that pass all tests; None: there are no such levels, or the tests were
+        stopped.
         """
         least_share = 1.0 if self._trial.wide else _LEAST_SHARE
         first, *others = COUNTS if self._levels is None else (len(self._levels),)
@@ -96,28 +106,28 @@ class MaterialTrial:
         # For a tooth and a rod with a metal pin, the best is 0.3 and 1 % worse here; for packed grains it is 4 %
         # better.
         if not chosen.levels or np.square(best).sum() >= np.square(self.smooth).sum():
-            return
+            return None
         if self._levels is None and len(chosen.levels) == COUNTS[-1]:
             best, chosen = self._better(best, chosen, COUNTS[-1] + 1, share)
         count = len(chosen.levels)
         best, chosen, tv_share = self._share_of_smoothing(best, chosen, least_share)
         if not significantly_better(best, self.smooth, LEAST_GAIN):
-            return
+            return None
         weakly, _ = self._tried(count, chosen.tv_share, WEAK_PULL)
-        if significantly_better(weakly, best, LEAST_GAIN):
-            return
+        if self._trial.ended or significantly_better(weakly, best, LEAST_GAIN):
+            return None
         # For a fit, the same number of further iterations of total variation also predicts smooth samples better.
         if self._trial.settings.early:
             continued = self._trial.volume_of_weight(self._weight, self._start, self._sweeps)
             if not significantly_better(best, self._trial.residuals(continued), LEAST_GAIN):
-                return
+                return None
         materials = chosen._replace(tv_share=tv_share)
         if (
             self._trial.residuals(self._volume_by(pull_to(materials, self._trial.problem, self._start))).mean()
             >= self.smooth.mean()
         ):
             materials = materials._replace(noise=LEAST_NOISE)
-        self.best, self.materials = best, materials
+        return best, materials
 
     def _share_of_smoothing(
         self, best: F64, chosen: MaterialPrior, least_share: float
@@ -151,14 +161,19 @@ class MaterialTrial:
         return best, chosen
 
     def _tried(self, count: int, tv_share: float, pull: float = PULL) -> tuple[F64, MaterialPrior]:
-        """Residuals [view] of a test reconstruction, and its levels; infinite and None if there are fewer levels."""
+        """Residuals [view] of a test reconstruction, and its levels; infinite and none if there are fewer levels or the
+        tests were stopped.
+        """
+        none = np.full(self.smooth.shape, np.inf), MaterialPrior()
+        if self._trial.ended:
+            return none
         levels, weights = (
             fitted_levels(self._start[self._where], count)
             if self._levels is None
             else (np.array(self._levels), np.full(count, 1 / count))
         )
-        if self._trial.ended or (self._levels is None and not are_apart(levels)):
-            return np.full(self.smooth.shape, np.inf), MaterialPrior()
+        if self._levels is None and not are_apart(levels):
+            return none
         first = MaterialPrior(tuple(levels.tolist()), tuple(weights.tolist()), tv_share, pull, NOISE)
         none_thin, noise = np.broadcast_to(np.int8(0), self._start.shape), min(NOISE, LEAST_NOISE / math.sqrt(tv_share))
         towards = MaterialPull(first._replace(noise=noise), self._where, none_thin, follows=self._levels is None)

@@ -38,6 +38,10 @@ of the middle between two levels).
 """
 _REFIT_SWEEPS = 16  # number of iterations; error bars make a share of them
 _TRIALS = 7  # usual number of test reconstructions with levels
+# Number of them after which levels are rejected for the voxel refinement of a fit, usually at most: the numbers of
+# levels, two more shares of total variation, a weaker pull, and further iterations of total variation. (2, if total
+# variation alone predicts better.)
+_REJECTED = len(COUNTS) + 4
 
 
 @dataclass(frozen=True)
@@ -91,10 +95,10 @@ class Discrete(HalfVoxels):
 
     @property
     def refused_sweeps(self) -> int:
-        """Usual number of iterations of the tests that reject discrete levels; PnP-DCT may be tried after these
-        tests.
+        """Iterations of the tests that reject discrete levels for the voxel refinement of a fit, usually at most.
+        PnP-DCT may be tried after these tests.
         """
-        return len(COUNTS) * self.usual_sweeps
+        return _REJECTED * self.usual_sweeps
 
     @classmethod
     def probabilities(cls, volume: Volume, settings: Mapping[str, Any]) -> F32 | None:

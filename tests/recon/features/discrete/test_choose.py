@@ -22,18 +22,25 @@ VIEWS_HELD_OUT = 3
 
 class ToldTrial:
     """A trial whose volumes leave what `residuals_by_share` says; with other shares `own`, as the volume will be made;
-    pulled weakly, `weakly`; with three materials more than all."""
+    pulled weakly, `weakly`; not pulled, `continued`; with three materials more than all. It is stopped while it makes
+    the last of `ends_after` volumes."""
 
-    ended, settings = False, TrialSettings()
+    settings = TrialSettings()
 
     def __init__(
-        self, residuals_by_share: dict[float, float], *, wide: bool = False, weakly: float = 1.5, own: float = 0.9
-    ) -> None:
-        self.wide, self._weakly, self._own = wide, weakly, own
+        self, residuals_by_share: dict[float, float], *, wide: bool = False, weakly: float = 1.5, own: float = 0.9,
+        continued: float = 1.5, ends_after: int = 100,
+    ) -> None:  # fmt: skip
+        self.wide, self._weakly, self._own, self._continued = wide, weakly, own, continued
+        self._ends_after = ends_after
         self.problem = SimpleNamespace(projector=SimpleNamespace(grid=recon.Grid.matching(VIEWS), geometry=VIEWS))
         self.smooth = np.array((0.25, 0.5, 1.0), np.float32)[np.arange(16 * 16 * 4).reshape(16, 16, 4) % 3]
         self._by_share, self._by_volume = residuals_by_share, {id(self.smooth): 1.0}
         self.made: list[F32] = []  # so that no two volumes have one id
+
+    @property
+    def ended(self) -> bool:
+        return len(self.made) >= self._ends_after
 
     def volume_of_weight(self, weight: float, start: F32, sweeps: int, pull: Any = None) -> F32:
         two = pull is not None and len(pull.materials.levels) == 2
@@ -42,11 +49,11 @@ class ToldTrial:
             WEAK_PULL: lambda: self._weakly,
         }
         self.made.append(start.copy())
-        self._by_volume[id(self.made[-1])] = by_pull[pull.share]() if two else 1.5
+        self._by_volume[id(self.made[-1])] = by_pull[pull.share]() if two else 1.5 if pull else self._continued
         return self.made[-1]
 
     def residuals(self, x: F32) -> NDArray[np.float64]:
-        return np.full(VIEWS_HELD_OUT, self._by_volume[id(x)])
+        return np.full(VIEWS_HELD_OUT, np.inf if self.ended else self._by_volume[id(x)])
 
 
 def chosen_share(residuals_by_share: dict[float, float]) -> float:
@@ -102,11 +109,32 @@ def test_fewer_voxels_are_pulled_if_the_volume_would_predict_worse_than_total_va
     assert choice.materials.levels and choice.materials.noise == noise
 
 
-def test_few_materials_that_predict_no_better_are_refused_after_two_volumes() -> None:
-    trial: Any = ToldTrial({1: 1.01})
+@pytest.mark.parametrize(
+    ("residuals_by_share", "weakly", "count"),
+    [
+        ({1: 1.01}, 1.5, 2),
+        ({2: 0.98, 1: 0.95, 0.5: 0.96}, 0.70, 5),
+        ({2: 0.98, 1: 0.95, 0.5: 0.96}, 1.5, 6),  # the last one: further iterations of total variation
+    ],
+)
+def test_levels_of_a_fit_are_rejected_after_few_volumes(
+    residuals_by_share: dict[float, float], weakly: float, count: int
+) -> None:
+    trial: Any = ToldTrial(residuals_by_share, weakly=weakly, continued=0.94)
+    trial.settings = TrialSettings(early=True)
     choice = MaterialTrial(trial, 1.0, 16, None)
     choice.choose()
-    assert not choice.materials.levels and len(trial.made) == recon.Discrete().refused_sweeps / USUAL_SWEEPS
+    assert not choice.materials.levels and len(trial.made) == count
+    assert count <= recon.Discrete().refused_sweeps / USUAL_SWEEPS <= 6
+
+
+@pytest.mark.parametrize("after", range(1, 7))
+def test_a_stop_ends_the_tests_and_levels_that_did_not_pass_all_of_them_are_not_used(after: int) -> None:
+    trial: Any = ToldTrial({2: 0.98, 1: 0.80, 0.5: 0.70, 0.25: 0.69}, ends_after=after)
+    choice = MaterialTrial(trial, 1.0, 16, None)
+    choice.choose()
+    assert len(trial.made) == after and not choice.materials.levels
+    np.testing.assert_array_equal(choice.best, choice.smooth)
 
 
 def test_of_a_sample_wider_than_the_field_no_less_of_total_variation_is_tried() -> None:
