@@ -86,7 +86,7 @@ class StreamingFit:
     @property
     def n_unlearnt(self) -> int:
         """Number of projections that no step has used yet."""
-        return len(self._stage.unseen) if isinstance(self._stage, Growing) else 0
+        return len(self._stage.unseen)
 
     @property
     def settings(self) -> FitSettings:
@@ -126,8 +126,6 @@ class StreamingFit:
         Raises:
             ValueError: there is no model yet.
         """
-        if isinstance(self._stage, Waiting):
-            raise ValueError("there is no model yet to compare with the newest projection")
         return self._stage.newest(self.settings)
 
     def replace_views(self, data: F32, kept: ArrayLike | None = None) -> None:
@@ -171,9 +169,7 @@ class StreamingFit:
 
     def clear(self) -> None:
         """Drop all projections and the model, so that their memory is free."""
-        stage = self._stage
-        rng = stage.state.rng if isinstance(stage, Growing) else stage.rng
-        self._stage = Waiting(Arrivals(stage.views.template), (), rng)
+        self._stage = self._stage.cleared()
 
     def advance(self, seconds: float) -> Progress:
         """Fit for about `seconds` s (at least one step if there is a model), and return the progress."""
@@ -197,8 +193,7 @@ class StreamingFit:
         If the fit was too slow during the scan, the final fit makes the missing steps.
         """
         each_view_once = math.ceil(self.n_views / self.settings.views_per_step)
-        taken = self._stage.state.step if isinstance(self._stage, Growing) else 0
-        return min(DEFAULT_STEPS, max(each_view_once, DEFAULT_STEPS - taken))
+        return min(DEFAULT_STEPS, max(each_view_once, DEFAULT_STEPS - self.progress().step))
 
     def finish(self, seconds: float = math.inf, on_progress: Callable[[Progress], bool] | None = None) -> Progress:
         """Make the final fit to all projections after the scan. The final fit has `last_steps` steps; a time limit of

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import ClassVar, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,7 @@ class Waiting:
     images: tuple[F32, ...]
     rng: np.random.Generator
     round_views: int = 0
+    unseen: ClassVar[tuple[int, ...]] = ()
 
     def followed_by(self, images: F32, angles: F64) -> Waiting:
         """The state with new projections [view, row, col]."""
@@ -76,6 +78,10 @@ class Waiting:
         """With other line integrals [view, row, col] of projections `kept`; None: of all."""
         views = self.views if kept is None else self.views.only(kept)
         return Waiting(views, tuple(images), self.rng)
+
+    def cleared(self) -> Waiting:
+        """The state without projections."""
+        return Waiting(Arrivals(self.views.template), (), self.rng)
 
     def about(self, axis_col: float) -> Waiting:
         """The state with the rotation axis at another column."""
@@ -105,6 +111,10 @@ class Waiting:
         """
         first = place_gaussians(self.views, self.images, plan, self.rng, all_views=True)
         return Growing.of(self.views, first)._with_room(plan, final=True)
+
+    def newest(self, settings: FitSettings) -> NoReturn:
+        """Raise ValueError: no model can be compared with the newest projection."""
+        raise ValueError("there is no model yet to compare with the newest projection")
 
     def volume(self, grid: Grid, settings: FitSettings) -> Volume:
         """A volume of zeros."""
@@ -191,6 +201,10 @@ class Growing:
             self, views=views, problem=problem, unseen=(), schedule_step=self.state.step,
             round_views=min(self.round_views, views.n),
         )  # fmt: skip
+
+    def cleared(self) -> Waiting:
+        """The state without projections and without a model, so that their memory is free."""
+        return Waiting(Arrivals(self.views.template), (), self.state.rng)
 
     def _others(self, images: F32, which: NDArray[np.intp]) -> bool:
         """Whether these line integrals differ from the projections `which` by more than a fifth (norm)."""
