@@ -214,8 +214,8 @@ def read_views(
         data, frames = data[alive], frames[alive]
     lit, part = np.ones(len(frames), np.bool_), filters.within(rows)
     beam = None if references is None else (references.dark[part], references.flats[0][1][part])
-    for view in np.flatnonzero(scan.suspect(data, beam)):
-        lit[view] = not scan.unlit(int(frames[view]))
+    for view in np.flatnonzero(scan.light.suspect(data, beam)):
+        lit[view] = not scan.light.unlit(int(frames[view]))
     if not lit.all():
         data, frames = data[lit], frames[lit]
     if warn is not None:
@@ -249,7 +249,7 @@ def unlit_sentence(scan: ScanEvidence, asked: NDArray[np.int64], lit: NDArray[np
     """A sentence about requested projections without beam, and the gap in angle that they leave; empty if all
     projections have beam.
     """
-    unlit = np.intersect1d(np.setdiff1d(asked, lit), np.array(scan.known_unlit, np.int64))
+    unlit = np.intersect1d(np.setdiff1d(asked, lit), np.array(scan.light.known_unlit, np.int64))
     if not unlit.size:
         return ""
     gap = f", and{gap_text}" if (gap_text := gap_sentence(scan.source, asked, lit)) else ""
@@ -265,7 +265,7 @@ def no_view(scan: ScanEvidence, references: References | None) -> NoViewError:
     beside_flats = (
         ""
         if references is None
-        else f" The brightest projections have {scan.brightest:.2g} of the intensity of the flats. If the "
+        else f" The brightest projections have {scan.light.brightest:.2g} of the intensity of the flats. If the "
         "projections were already divided by their flats, give --quantity transmission or "
         "line-integrals."
     )

@@ -16,7 +16,7 @@ from beamline.monitor.evidence import BRIGHT
 from beamline.projections.preparation import Preparation
 from beamline.projections.read import read_binned, spoilt_frames
 from beamline.projections.selection import SelectedScan
-from beamline.storage.rules.evidence import ScanEvidence
+from beamline.storage.rules.evidence import ScanEvidence, by_exposure
 from drivers.base.frame import FrameKind
 from recon.prep.dynamic_flats import find_dynamic_flats
 from recon.prep.references import References, dark_at, dead_pixels
@@ -75,7 +75,7 @@ class _Reading:
 
     def darks(self, frames: NDArray[np.int64]) -> list[tuple[float, NDArray[np.float64]]]:
         """(exposure in s, mean dark) for each exposure. If exposures are equal or unknown: (NaN, mean of all darks)."""
-        means = [(seconds, self.mean(some)) for seconds, some in self.evidence.by_exposure(frames)]
+        means = [(seconds, self.mean(some)) for seconds, some in by_exposure(self.evidence.table, frames)]
         return [(seconds, mean) for seconds, mean in means if mean is not None]
 
 

@@ -25,7 +25,8 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.transforms import WRAPPED, brief_source
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.rules import Finding
-from beamline.storage.rules.evidence import VIEWS, ScanEvidence
+from beamline.storage.rules.evidence import ScanEvidence
+from beamline.storage.rules.illumination import VIEWS
 from beamline.storage.rules.pixels import CONSTANT_DARKS
 from beamline.storage.rules.scan import altered_sentence, findings_of
 from beamline.storage.rules.stored_order import SINOGRAM
@@ -121,7 +122,7 @@ def views_lit(scan: ScanEvidence, every: bool) -> Iterator[Finding]:
     """The projections are exposed throughout the scan. `beamline recon` lists dark projections and leaves them out."""
     views = scan.table.views
     looked_at = views if every else spread(views, VIEWS)
-    unlit = [] if scan.beam is None else [row for row in looked_at.tolist() if scan.unlit(row)]
+    unlit = [] if scan.beam is None else [row for row in looked_at.tolist() if scan.light.unlit(row)]
     if unlit:
         of = f"{views.size} projections" if every else f"{looked_at.size} projections checked"
         more = "" if every else " `validate --deep` checks all projections."

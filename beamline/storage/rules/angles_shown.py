@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from beamline.monitor.evidence import lit_places
 from beamline.storage.rules import Finding
-from beamline.storage.rules.evidence import LEAST, VIEWS, ScanEvidence, brightness
+from beamline.storage.rules.evidence import ScanEvidence
+from beamline.storage.rules.illumination import LEAST, VIEWS, brightness
 from drivers.base.frame import FrameKind
 from recon.base.views import spread
 from recon.prep.align import mirror_mismatch
@@ -86,7 +87,7 @@ class CoarseViews:
             posts = ((cells - dark < DARK * (flat - dark)) | ~lit).all(axis=0) & lit.any(axis=0)
             if posts.any():
                 return False
-        return brightness(cells, dark, flat) > LEAST * self.scan.brightest
+        return brightness(cells, dark, flat) > LEAST * self.scan.light.brightest
 
     def lit(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
         """bool [view], True if the projection has beam and shows a sample."""
@@ -141,7 +142,7 @@ def coarse_views(scan: ScanEvidence) -> CoarseViews | None:
     lacking = scan.in_counts and not scan.table.has(FrameKind.DARK, FrameKind.FLAT)
     if lacking or min(scan.source.shape[1], views.size) < _LEAST_SEEN:
         return None
-    _ = scan.brightest  # some of these frames may turn out to be unreadable
+    _ = scan.light.brightest  # some of these frames may turn out to be unreadable
     views = np.array([row for row in views.tolist() if row not in scan.source.unreadable], np.int64)
     return CoarseViews(scan, views, np.degrees(scan.table.angles)) if views.size >= _LEAST_SEEN else None
 

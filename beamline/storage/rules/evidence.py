@@ -15,30 +15,23 @@ from numpy.typing import NDArray
 
 from beamline.core.flag import Finding
 from beamline.monitor.digest import block_means, check_block, is_valid, subsampled
-from beamline.monitor.evidence import BRIGHT, DRIFT, LEAST_NOISE, Evidence, FrameStatistics, full_scale, lit_places
+from beamline.monitor.evidence import DRIFT, LEAST_NOISE, Evidence, FrameStatistics, full_scale, lit_places
 from beamline.monitor.references import ReferenceLimits, reference_findings
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.rules.illumination import VIEWS, Illumination
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32, F64, I64
-from recon.base.noise import deviation_between_neighbours
 from recon.base.views import spread
 from recon.prep.references import dark_at
 from recon.prep.unmeasured import with_borders_filled
 
-# number of projections with which flats are compared: from the whole scan, and on each side of each group of flats
-VIEWS, BESIDE = 32, 2
+BESIDE = 2  # number of projections, on each side of each group of flats, with which the flats are compared
 # flats are compared with projections by means over groups of pixels: a frame has about so many groups across
 CELLS_ACROSS = 32
 WORST = 99.0  # percentile of the groups of pixels of a projection; not the largest value, because of zingers
 EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure time by up to this share
-# fraction of the brightest projections' intensity that the bright part of every projection exceeds, because the sample
-# does not cover the whole frame
-LEAST = 0.01
-_SUSPECT = 0.1  # share of the flats' intensity: a brighter projection is not examined more closely
-_ACROSS = 32  # approximate number of pixels along each side in which a projection is first checked
-_TAIL = 1.2816  # standard deviations of the noise: BRIGHT percent of the noise are below
 
 
 class ReferenceGroups(NamedTuple):
@@ -81,7 +74,6 @@ class ScanEvidence:
     asked: EvidenceRequest = field(default_factory=EvidenceRequest)
     table: FrameTable = field(init=False)
     _seen: dict[int, FrameStatistics] = field(default_factory=dict)
-    _lit: dict[int, bool] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "table", self.source.table)
@@ -218,20 +210,9 @@ class ScanEvidence:
         views = self.table.exposures[self.table.views]
         return bool(views.size and (views > 0).all() and np.ptp(views) > EXPOSURE_TOLERANCE * np.median(views))
 
-    def by_exposure(self, rows: I64) -> list[tuple[float, I64]]:
-        """These frames grouped by exposure. There is a single group, with the exposure NaN, if an exposure is unknown
-        or if all frames have the same.
-        """
-        seconds = self.table.exposures[rows]
-        if not rows.size or not (seconds > 0).all() or np.ptp(seconds) <= EXPOSURE_TOLERANCE * seconds.min():
-            return [(np.nan, rows)]
-        order = np.argsort(seconds, kind="stable")
-        edges = np.flatnonzero(np.diff(seconds[order]) > EXPOSURE_TOLERANCE * seconds[order][:-1]) + 1
-        return [(float(np.median(self.table.exposures[part])), np.sort(part)) for part in np.split(rows[order], edges)]
-
     @cached_property
     def _darks(self) -> list[tuple[float, I64]]:
-        return self.by_exposure(self.table.darks)
+        return by_exposure(self.table, self.table.darks)
 
     @cached_property
     def exposures(self) -> F64:
@@ -256,8 +237,6 @@ class ScanEvidence:
                 return np.where(np.isin(np.arange(len(table)), flats), each, exposures)
         return exposures
 
-    # Intensity of whole projections; a single band of rows would not do, because the sample may be opaque there
-
     @cached_property
     def beam(self) -> tuple[F32, F32] | None:
         """Cells [cell row, cell col] of the mean dark and of the mean flat that are used; None if the projections are
@@ -269,54 +248,9 @@ class ScanEvidence:
         return dark, flat
 
     @cached_property
-    def brightest(self) -> float:
-        """Brightness, relative to the flats, of the brightest of some projections (see `brightness`); 1 if there are no
-        projections.
-        """
-        if self.beam is None:
-            return 1.0
-        seen = [brightness(cells, *self.beam) for cells in self.cells(spread(self.table.views, VIEWS))]
-        return float(np.percentile(seen, BRIGHT)) if seen else 1.0
-
-    def suspect(self, data: NDArray[np.generic], beam: tuple[F32, F32] | None) -> NDArray[np.bool_]:
-        """bool [view], True if a projection is dark or uniform in the given pixels, which may be a band of rows.
-
-        Args:
-            data: [view, row, col], as read.
-            beam: dark and flat [row, col] of the same pixels; None: the data are line integrals.
-        """
-        uniform = np.array([view.min() == view.max() for view in data], np.bool_)
-        if beam is None or not len(data):
-            return uniform
-        some = tuple(slice(None, None, max(1, n // _ACROSS)) for n in beam[0].shape)
-        dark, intensity = beam[0][some], (beam[1] - beam[0])[some]
-        lit, least = lit_places(intensity), _SUSPECT * max(self.brightest, 0.0)
-        shares = [np.median((view[some] - dark)[lit] / intensity[lit]) if lit.any() else 0.0 for view in data]
-        return uniform | ~(np.array(shares) >= least)
-
-    def unlit(self, row: int) -> bool:
-        """True if a whole projection is dark, or if it is uniform while the flats are not; each projection is checked
-        once."""
-        if row not in self._lit:
-            self._lit[row] = not self._unlit(row)
-        return not self._lit[row]
-
-    @property
-    def known_unlit(self) -> list[int]:
-        """The projections without beam, among the checked ones."""
-        return [row for row, lit in self._lit.items() if not lit]
-
-    def _unlit(self, row: int) -> bool:
-        image = read_known(self.source, [row])[0]
-        if row in self.source.unreadable:
-            return False  # the caller names the frame and leaves it out
-        if not np.isfinite(image).any():
-            return True
-        same = bool(image.min() == image.max())
-        if self.beam is None:
-            return same
-        bright = brightness(self.frame(row).places, *self.beam)
-        return bright < LEAST * self.brightest or (same and bool(np.ptp(self.beam[1]) > 0))
+    def light(self) -> Illumination:
+        """Which projections have beam."""
+        return Illumination(self.source, self.table.views, self.beam, lambda row: self.frame(row).places)
 
 
 def groups_of(table: FrameTable, kind: FrameKind) -> tuple[I64, ...]:
@@ -330,6 +264,18 @@ def groups_of(table: FrameTable, kind: FrameKind) -> tuple[I64, ...]:
     return tuple(np.split(rows, np.flatnonzero(np.diff(before)) + 1)) if rows.size else ()
 
 
+def by_exposure(table: FrameTable, rows: I64) -> list[tuple[float, I64]]:
+    """These frames grouped by exposure in s. There is a single group, with the exposure NaN, if an exposure is unknown or
+    if all frames have the same.
+    """
+    seconds = table.exposures[rows]
+    if not rows.size or not (seconds > 0).all() or np.ptp(seconds) <= EXPOSURE_TOLERANCE * seconds.min():
+        return [(np.nan, rows)]
+    order = np.argsort(seconds, kind="stable")
+    edges = np.flatnonzero(np.diff(seconds[order]) > EXPOSURE_TOLERANCE * seconds[order][:-1]) + 1
+    return [(float(np.median(table.exposures[part])), np.sort(part)) for part in np.split(rows[order], edges)]
+
+
 def look_at(image: NDArray[Any], row: int) -> FrameStatistics:
     """Statistics of an image, with its cells."""
     counts, block = image.dtype.kind in "ui", check_block(image.shape)
@@ -338,19 +284,3 @@ def look_at(image: NDArray[Any], row: int) -> FrameStatistics:
     invalid = 0.0 if image.dtype == np.uint16 else 1 - float(np.mean(is_valid(image)))
     kind, rounding = FrameKind.INVALID, LEAST_NOISE * counts
     return FrameStatistics(row, kind, np.nan, saturated, np.array(subsampled(blocks)), block, rounding, invalid, cells)
-
-
-def brightness(view: F32, dark: F32, flat: F32) -> float:
-    """Brightness of the bright part of a projection relative to the flats, from images of cells. It is corrected for
-    the bias that noise causes.
-    """
-    intensity = flat - dark
-    lit = lit_places(intensity)
-    if not lit.any():
-        return 1.0
-    share = np.where(lit, (view - dark) / np.where(lit, intensity, 1), np.nan)
-    noise = deviation_between_neighbours(share)
-    known = share[np.isfinite(share)]
-    if not known.size:
-        return 0.0
-    return max(float(np.median(known)), float(np.percentile(known, BRIGHT)) - _TAIL * noise)

@@ -39,7 +39,7 @@ def test_rules_on_light_and_angles_read_each_frame_once_for_all_of_them() -> Non
     read = rows_read(source)
     assert read == sorted(set(read)) and set(range(8)) <= set(read)
     before = len(source.was_read)
-    assert all(evidence.used) and 0 < evidence.brightest <= 1.1 and evidence.unlit(8 + 20) is not None
+    assert all(evidence.used) and 0 < evidence.light.brightest <= 1.1 and evidence.light.unlit(8 + 20) is not None
     assert all(rows == [28] for rows, _ in source.was_read[before:])
 
 
@@ -71,7 +71,7 @@ def test_faulty_references_are_left_out_or_accepted_as_they_are() -> None:
 def test_without_references_or_counts_no_beam_is_known() -> None:
     source = scan()
     source.table = FrameTable.of(np.zeros(48), np.linspace(0, 3, 48))
-    assert ScanEvidence(source).beam is None and ScanEvidence(source).brightest == 1
+    assert ScanEvidence(source).beam is None and ScanEvidence(source).light.brightest == 1
     source = scan()
     source.quantity = "line_integrals"
     evidence = ScanEvidence(source)
