@@ -4,8 +4,12 @@ disk is full.
 
 from __future__ import annotations
 
+import math
+import shutil
 import time
 from collections import deque
+from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 
@@ -21,6 +25,8 @@ from drivers.frame_memory import FrameMemory
 WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
 WAITING_FRAMES = (4, 128)  # smallest and largest number of frames
 CHECKED_FRAMES = 2  # largest number of frames that wait between the threads of the recorder
+LOOK = 1.0  # real s between two checks of the free space
+BRAKING = 5.0  # s for which frames may still come after a pause was requested
 EVENT_INTERVAL = 0.1  # real s between `frame` events
 RATE_FRAMES = 20  # number of last frames from which the rate is computed
 
@@ -96,6 +102,25 @@ def hold_for_backlog(pause: PauseRequest, most: int, waiting: int, checking: flo
         )
     elif 4 * waiting <= most:
         pause.release(Cause.BACKLOG)
+
+
+class DiskSpace:
+    """Pauses a scan before its disk is full. It looks at the free space about once a second."""
+
+    def __init__(self, pause: PauseRequest, folder: Path, timeline: Timeline) -> None:
+        self._pause, self._folder, self._looked_at = pause, folder, -math.inf
+        self._row_bytes = timeline.total_bytes // timeline.n_frames
+        on_the_way = math.ceil(BRAKING / timeline.views.period) if timeline.views.trains else 1
+        in_work = CHECKED_FRAMES + 2
+        self._reserve = self._row_bytes * (room(timeline) + in_work + on_the_way)
+
+    def look(self, n_left: int) -> None:
+        """Look at the free space if the last look was longer ago than LOOK. `n_left` frames must still be written."""
+        if time.monotonic() - self._looked_at > LOOK:
+            self._looked_at = time.monotonic()
+            with suppress(OSError):  # a failing disk ends the scan only when it does not accept a frame
+                remaining = max(0, n_left) * self._row_bytes
+                hold_for_space(self._pause, self._reserve, shutil.disk_usage(self._folder).free, remaining)
 
 
 class FrameProgress:

@@ -7,9 +7,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 
 from beamline.core.events import FrameFlagged, Sink, Warned
 from beamline.core.stop import PauseRequest, StopRequest
+from beamline.core.text import count, spans
 from beamline.monitor.check import Flag, Level, Policy
 from beamline.monitor.checks import flagged_frames
 from beamline.plan.plan import Retake
@@ -36,13 +38,17 @@ class FlaggedFrames:
     ) -> None:
         self._sink, self._react, self._retaken_warnings = sink, react, retaken_warnings
         self._flags: list[Flag] = []
+        self._unchecked: list[int] = []  # rows
         self._active: set[tuple[str, Level]] = set()
         self._triggers: dict[int, int] = {}  # triggers of the projections, by row
         self._replaced: set[int] = set()
         self.retaken = 0
 
-    def add(self, frame: Frame, flags: tuple[Flag, ...]) -> None:
-        """The next frame, in the order of the file."""
+    def add(self, frame: Frame, flags: tuple[Flag, ...] | None) -> None:
+        """The next frame, in the order of the file. None: the monitor did not check it."""
+        if flags is None:
+            self._unchecked.append(frame.index)
+            flags = ()
         self._flags += [replace(flag, advice="") for flag in flags]
         if frame.kind is FrameKind.PROJECTION:
             self._triggers[frame.index] = frame.trigger
@@ -80,6 +86,14 @@ class FlaggedFrames:
         takes it again."""
         warned = self._frames(lambda flag: flag.level is Level.WARN and flag.check in self._retaken_warnings)
         return [Retake(row, self._triggers[row]) for row in sorted((self.alarmed | warned) & self._triggers.keys())]
+
+    def unchecked(self, path: Path) -> str:
+        """Frames that the monitor has not checked, in words, for the file at `path`; "" if it has checked all so
+        far."""
+        if not self._unchecked:
+            return ""
+        frames = f"{count(len(self._unchecked), 'frame')} ({spans(self._unchecked)})"
+        return f"The monitor did not check {frames}: they have no flags. `beamline monitor {path}` checks them."
 
     def _frames(self, which: Callable[[Flag], bool]) -> set[int]:
         """Frames with such a flag, without those that were taken again."""

@@ -186,7 +186,7 @@ class Measurement:
         with ended.kept():
             if self.instrument.simulated is not None and not recorder.hangs:
                 write_labels(labels_path(writer.path), labels.runs(writer.committed), writer.committed)
-        for remark in filter(None, (*writer.remarks, recorder.unjudged)):
+        for remark in filter(None, (*writer.remarks, recorder.flagged.unchecked(writer.path))):
             self.sink(Warned(remark))
         with ended.kept():
             release()

@@ -16,7 +16,17 @@ from beamline.monitor.checks import CHECKS
 PACKAGE = Path(beamline.__file__).parent
 PLACES = [
     *sorted((PACKAGE / "monitor").glob("*.py")),
-    *(PACKAGE / part for part in ("scan/references.py", "scan/recorder.py", "scan/measurement.py", "cli/monitor.py")),
+    *(
+        PACKAGE / part
+        for part in (
+            "scan/references.py",
+            "scan/recorder.py",
+            "scan/frame_checks.py",
+            "scan/flagged.py",
+            "scan/measurement.py",
+            "cli/monitor.py",
+        )
+    ),
     *(PACKAGE / part for part in ("projections/replay.py", "reconstruct/scan_facts.py", "storage/rules/light.py")),
 ]
 VALUES = {"N": "3", "VOLUME": "volume.h5", "FILE": "scan.h5", "SECONDS": "30"}

@@ -39,7 +39,7 @@ def test_a_scan_pauses_before_its_disk_is_full_and_goes_on_when_there_is_space()
 def test_a_scan_waits_for_space_on_its_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another program takes it while the ninth frame is exposed, and gives it back when the scan has paused."""
     free = [10**12]
-    monkeypatch.setattr(recorder, "LOOK", 0.01)
+    monkeypatch.setattr(backlog, "LOOK", 0.01)
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=free[0]))
 
     def take() -> None:

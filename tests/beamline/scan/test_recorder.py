@@ -19,7 +19,7 @@ from beamline.core.stop import ScanAborted, StopRequest
 from beamline.monitor.check import Flag, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.watch import start
-from beamline.scan import backlog, measurement
+from beamline.scan import backlog, frame_checks, measurement
 from beamline.scan import recorder as module
 from beamline.scan.flagged import FlaggedFrames
 from beamline.scan.recorder import Recorder
@@ -193,7 +193,7 @@ def test_a_monitor_with_a_defect_costs_no_frame(tmp_path: Path, monkeypatch: pyt
     def broken(*_: object) -> None:
         raise ZeroDivisionError("defect")
 
-    monkeypatch.setattr(module, "look_past_failures", broken)
+    monkeypatch.setattr(frame_checks, "look_past_failures", broken)
     ran = Ran(tmp_path, FakeInstrument())
     assert ran.error is None
     ran.assert_good_file(19, "complete")

@@ -16,7 +16,7 @@ from beamline.core.errors import BeamlineError, exit_code
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.monitor.check import CheckResult, Flag, Level
 from beamline.monitor.field import MassCheck
-from beamline.scan import recorder
+from beamline.scan import frame_checks
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.errors import DeviceError
@@ -84,7 +84,7 @@ class Broken:
 
 def _ran(runs: Path, place: str, which: int, nth: int, once: bool = False, mode: str = "fly") -> Ran:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(recorder, "COMPILES", 600.0)  # on a busy machine
+        patch.setattr(frame_checks, "COMPILES", 600.0)  # on a busy machine
         broken = Broken(patch, place, which, nth, once)
         return Ran(runs, broken.instrument, f"scan.mode={mode}", heard=broken.heard)
 
@@ -138,8 +138,8 @@ def test_a_check_that_hangs_costs_no_frame_and_holds_up_no_end(
 ) -> None:
     """Its frame and those that wait behind it are stored; what was not judged is said."""
     for name in ("CHECKS", "ABORTED"):
-        monkeypatch.setattr(recorder, name, 0.05 if (name == "ABORTED") is aborted else 600.0)
-    monkeypatch.setattr(recorder, "SLICE", 0.02)
+        monkeypatch.setattr(frame_checks, name, 0.05 if (name == "ABORTED") is aborted else 600.0)
+    monkeypatch.setattr(frame_checks, "SLICE", 0.02)
     stop, free, look = StopRequest(), threading.Event(), MassCheck.look
 
     def hangs(check: MassCheck, state: Any, frame: Any, *rest: Any) -> Any:
