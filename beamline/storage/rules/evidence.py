@@ -265,8 +265,8 @@ def groups_of(table: FrameTable, kind: FrameKind) -> tuple[I64, ...]:
 
 
 def by_exposure(table: FrameTable, rows: I64) -> list[tuple[float, I64]]:
-    """These frames grouped by exposure in s. There is a single group, with the exposure NaN, if an exposure is unknown or
-    if all frames have the same.
+    """These frames grouped by exposure in s. There is a single group, with the exposure NaN, if an exposure is unknown
+    or if all frames have the same.
     """
     seconds = table.exposures[rows]
     if not rows.size or not (seconds > 0).all() or np.ptp(seconds) <= EXPOSURE_TOLERANCE * seconds.min():

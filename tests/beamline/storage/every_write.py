@@ -194,7 +194,7 @@ class Rig:
         """Continue the scan that `begin` started, in a copy of its file; returns its remarks."""
         assert self.writer is not None
         copy = os.open(self.scan, os.O_RDWR)
-        os.dup2(copy, self.writer._file.id.get_vfd_handle())
+        os.dup2(copy, self.writer._file.file.id.get_vfd_handle())
         os.close(copy)
         self.writer.path = self.scan
         return self.go_on(self.writer)

@@ -169,7 +169,7 @@ def test_what_was_flushed_is_brought_to_the_disk_and_at_the_end_all(
     monkeypatch.setattr(os, "fsync", fsync)
     monkeypatch.setattr(disk_file, "SECONDS", 0.0)
     with NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock) as writer:
-        handle = writer._file.id.get_vfd_handle()
+        handle = writer._file.file.id.get_vfd_handle()
         for frame in frames:
             begun.clear()
             append(writer, frame)
@@ -194,7 +194,7 @@ def test_a_disk_that_did_not_take_what_was_flushed_is_told(
     with pytest.raises(DataError, match=r"store the frame .*Input/output error.*first 3 frames"):
         for frame in frames:
             append(writer, frame)
-            if (thread := writer._to_disk._thread) is not None:
+            if (thread := writer._file._to_disk._thread) is not None:
                 thread.join()
     assert (writer.committed, writer.safe) == (5, 3)  # of the other two nobody knows
     writer.close("failed")
