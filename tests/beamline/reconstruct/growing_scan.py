@@ -88,7 +88,7 @@ def schedule(
     if status is not None:
         clock.due.append((end, lambda: writers[0].close(status)))
     else:
-        clock.due.append((end, lambda: writers[0]._lock.release()))  # the lock of a dead program is released
+        clock.due.append((end, lambda: writers[0]._file.lock.release()))  # the lock of a dead program is released
         # Hours later, so that the file is closed when the test is over.
         clock.due.append((end + 1e5, lambda: writers[0].close("failed")))
 
