@@ -24,7 +24,7 @@ LEAST_GAIN = 0.02
 """
 
 # name of the measure in the explanation of a choice
-_MEASURE = "root mean square residual in held-out projections, as line integrals"
+MEASURE = "root mean square residual in held-out projections, as line integrals"
 _ERRORS = 1.0  # standard errors of the difference; below it, two candidates count as equally good
 # largest number of octaves from the first strength: cones with coarse voxels need 6 to 9, and 40 change nothing
 _OCTAVES = 10
@@ -168,7 +168,7 @@ class TrialChoice(NamedTuple):
         given = [(each.name, np.mean(each.residuals)) for each in self.predictions if each.residuals is not None]
         listed = [f"{name} {mean:#.4g}" for name, mean in given]
         remarks = [each.remark for each in self.predictions if each.remark]
-        return f"test reconstructions of {self.where}, {_MEASURE}: {'; '.join([*listed, *remarks])}{self._of_the_best}"
+        return f"test reconstructions of {self.where}, {MEASURE}: {'; '.join([*listed, *remarks])}{self._of_the_best}"
 
     @property
     def _of_the_best(self) -> str:

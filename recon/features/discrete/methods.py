@@ -11,9 +11,9 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from recon.base.arrays import F32
-from recon.base.decisions import MaterialPrior, Prior
+from recon.base.decisions import Decisions, MaterialPrior, Prior
 from recon.base.empirical import STANDS_STILL
-from recon.base.method import Plain
+from recon.base.method import Plain, ReconProblem, Reconstruction, RunControl
 from recon.base.setting import Count, NonNegative
 from recon.base.volume import Volume
 from recon.features.discrete.choose import COUNTS, WEAK_PULL, MaterialTrial, pull_to
@@ -42,6 +42,11 @@ _TRIALS = 7  # usual number of test reconstructions with levels
 # levels, two more shares of total variation, a weaker pull, and further iterations of total variation. (2, if total
 # variation alone predicts better.)
 _REJECTED = len(COUNTS) + 4
+
+# the reason that a volume without levels states
+_NO_LEVELS = (
+    "this is the volume of fista-tv, because no discrete levels were found that predict held-out projections better"
+)
 
 
 @dataclass(frozen=True)
@@ -132,6 +137,14 @@ class Discrete(HalfVoxels):
         found = self._choice(trial, trial.weight)
         return trial.prediction(self.name, found.best, Prior(trial.weight, materials=found.materials))
 
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
+        decide = control.decide or Decisions(problem.seed)
+        result = super().run(problem, replace(control, decide=decide))
+        of_volume = decide.made.get(MATERIALS)
+        if of_volume is None or MaterialPrior(*of_volume[-1]).levels:
+            return result
+        return replace(result, chosen=_NO_LEVELS)
+
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         if x.any():  # a pull would hide the noise that the refits for error bars must show
             return FistaTv(self.iterations, still=self.still, half_voxels=self.half_voxels).iterate(problem, x)
@@ -142,11 +155,14 @@ class Discrete(HalfVoxels):
             return x
         if materials is None:
             return self.in_half_voxels(problem, x, mu, TV_STEPS)
+        before = 0 if problem.decide.ended is None else problem.decide.ended.after
         x = self.pulled(problem, x, weight, materials, self.first_sweeps)
+        if (ended := problem.decide.ended) is not None:
+            problem.decide.ended = ended._replace(after=before + ended.after)
         if not problem.go_on.going:
             return x
         pull = partial(pull_to, materials)
-        return self.in_half_voxels(problem, x, mu * materials.tv_share, TV_STEPS, pull, self.first_sweeps)
+        return self.in_half_voxels(problem, x, mu * materials.tv_share, TV_STEPS, pull, self.first_sweeps - before)
 
     def materials(
         self, problem: VoxelProblem, weight: TvWeight, trial: Callable[[], Trial | None]

@@ -22,6 +22,7 @@ from recon.features.reference.motion import KNOTS, Basis, MotionViews, Moved, af
 from recon.features.reference.particles import particles_of, placed
 from recon.voxels.choice import (
     LEAST_GAIN,
+    MEASURE,
     BestStrength,
     TrialChoice,
     exceeds_standard_error,
@@ -146,9 +147,9 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     others = [("the same total variation without the reference", trial.in_line_integrals(alone.residuals))]
     others += [] if least is None or choice.best is None else [(choice.predictions[choice.best].name, least)]
     own = trial.in_line_integrals(best.residuals)
-    told = f"root mean square residual in held-out projections, with the reference {own.mean():#.4g}"
+    told = f"{MEASURE}: with the reference {own.mean():#.4g}"
     for name, residuals in others:
-        told += f", by {name} {residuals.mean():#.4g}"
+        told += f"; with {name} {residuals.mean():#.4g}"
         if not significantly_better(own, residuals, LEAST_GAIN):
             return ReferenceVerdict(False, f"it does not predict held-out projections better than {name} ({told})")
     if (where := _better_displaced(trial, fit)) is not None:

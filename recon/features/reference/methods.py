@@ -200,6 +200,7 @@ class _State:
         fit = StateFit(problem, moved, start.astype(np.float32), weight, width)
         fit.rounds(_ROUNDS, _FIRST)
         fit.sharpen(_SHARPER, most=_LAST)
+        problem.decide.ended = None  # it describes only the last of several rounds
         self.moved = volume_slices(times_power(fit.m.copy(), problem.units.density))
         self.displacement = np.float32(edge) * fit.moved.u[[2, 0, 1]].transpose(0, 3, 1, 2)
         return fit.x

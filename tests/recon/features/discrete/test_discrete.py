@@ -64,6 +64,11 @@ def test_grains_of_two_materials_are_nearer_to_the_truth(of_grains: recon.Recons
 
 
 @pytest.mark.slow
+def test_the_record_counts_all_iterations(of_grains: recon.Reconstruction) -> None:
+    assert not of_grains.chosen and of_grains.settings["ended_after"] == len(of_grains.history)
+
+
+@pytest.mark.slow
 def test_the_probability_of_each_material_is_there_on_demand(of_grains: recon.Reconstruction) -> None:
     p, truth = recon.Discrete.probabilities(of_grains.volume, of_grains.settings), grains()
     assert p is not None and p.shape == (2, *GRID.shape)
@@ -76,6 +81,7 @@ def test_smooth_matter_is_that_of_total_variation() -> None:
     found = recon.reconstruct(data, VIEWS, recon.Discrete())
     np.testing.assert_array_equal(found.volume.data, recon.reconstruct(data, VIEWS, recon.FistaTv()).volume.data)
     assert "levels_of_materials" not in found.settings
+    assert found.chosen.startswith("this is the volume of fista-tv, because no discrete levels were found")
     assert recon.Discrete.probabilities(found.volume, found.settings) is None
 
 

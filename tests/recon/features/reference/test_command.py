@@ -220,7 +220,7 @@ def test_slabs_with_a_reference_are_the_whole_volume(
         file["exchange/data"], file["exchange/theta"] = lines, np.degrees(geometry.angles)
         file["exchange/data"].attrs["units"], file["exchange/theta"].attrs["units"] = "line_integrals", "deg"
         file.attrs["pixel_size_mm"] = 1.0
-    for name, memory in (("whole.h5", "1G"), ("parts.h5", "13M")):
+    for name, memory in (("whole.h5", "1G"), ("parts.h5", "16M")):
         done = beamline("recon", str(state), "--reference", str(good), "--axis", "23.5", "--quality", "preview",
                         "--no-report", "--memory", memory, "-o", str(tmp_path / name))  # fmt: skip
         assert done.exit_code == 0, done.output

@@ -52,6 +52,7 @@ def test_a_right_reference_is_used_and_shows_more(
     made = recon.reconstruct(*state, recon.FromReference(before, AUTO))
     assert made.method == "from-reference" and made.settings["reference_used"]
     assert made.chosen.startswith("The reference was used: root mean square residual in held-out projections")
+    assert "ended_after" not in made.settings  # the last of several rounds has no --iterations that allows more
     truth = STATE.volume
     assert psnr(made.volume.data, truth) > psnr(without.volume.data, truth) + 1.5
     assert made.change is not None and made.displacement is not None
