@@ -259,9 +259,9 @@ def improved(views: MotionViews, moved: Moved, basis: Basis, blur: float, beside
 
     of_u = share * 4 * kept + 6 * stiff / n_views
     scale = np.concatenate((of_u.ravel(), [share * float(np.square(part).sum()) * n / 4 for part in parts]))
-    step = _conjugate(
-        normal, back(views.weighed(residual)), n_views * scale + 1e-12, _STEPS if basis.intervals else _AFFINE_STEPS
-    )
+    scale = n_views * scale + 1e-12
+    steps = _STEPS if basis.intervals else _AFFINE_STEPS
+    step = conjugate(normal, back(views.weighed(residual)), lambda r: r / scale, steps)
     u, gains = moved.u.copy(), moved.gains.copy()
     u[: basis.axes] += basis.field(step[:size].reshape(basis.shape))
     if with_gains:
@@ -270,18 +270,18 @@ def improved(views: MotionViews, moved: Moved, basis: Basis, blur: float, beside
     return replace(moved, u=u, gains=np.maximum(gains, 0))
 
 
-def _conjugate(normal: Callable[[F64], F64], right: F64, scale: F64, steps: int) -> F64:
-    """Conjugate-gradient iterations (Hestenes & Stiefel 1952) from 0, preconditioned by a diagonal."""
+def conjugate(normal: Callable[[F64], F64], right: F64, scaled: Callable[[F64], F64], iterations: int) -> F64:
+    """Conjugate-gradient iterations (Hestenes & Stiefel 1952) from 0. `scaled` is the preconditioner."""
     x, r = np.zeros_like(right), right.copy()
-    z = r / scale
+    z = scaled(r)
     p, rz = z.copy(), float(r @ z)
-    for _ in range(steps):
+    for _ in range(iterations):
         q = normal(p)
         if not (curved := float(p @ q)) > 0:
             break
         a = rz / curved
         x, r = x + a * p, r - a * q
-        z, before = r / scale, rz
+        z, before = scaled(r), rz
         rz = float(r @ z)
         p = z + rz / before * p
     return x

@@ -11,7 +11,7 @@ reconstructed, so few projections suffice (Leclerc, Roux & Hild 2015, Exp. Mech.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from recon.base.arrays import F32, F64
+from recon.features.reference.motion import conjugate
 from recon.voxels.projector import Projector
 
 UNKNOWNS = 5  # unknowns of a particle: gain, growth of the diameter, shift along y, x and z
@@ -262,23 +263,6 @@ class Linear:
         ratio = np.abs(halves[0] - halves[1]) / 2 / alone
         typical = typical & (self.seen > _SOLID)
         return alone * np.sqrt(np.square(ratio[typical]).mean(0)) if typical.any() else alone
-
-
-def conjugate(normal: Callable[[F64], F64], right: F64, scaled: Callable[[F64], F64], iterations: int) -> F64:
-    """Preconditioned conjugate gradients (Hestenes & Stiefel 1952) from 0."""
-    x, r = np.zeros_like(right), right.copy()
-    z = scaled(r)
-    p, rz = z.copy(), float(r @ z)
-    for _ in range(iterations):
-        q = normal(p)
-        if not (curved := float(p @ q)) > 0:
-            break
-        a = rz / curved
-        x, r = x + a * p, r - a * q
-        z, before = scaled(r), rz
-        rz = float(r @ z)
-        p = z + rz / before * p
-    return x
 
 
 def gram(columns: F32) -> F64:
