@@ -79,11 +79,11 @@ class Auto(Method):
     ) -> tuple[Method, Reconstruction]:
         """The chosen candidate and its result. If no candidate was chosen, the last candidate whose library can be
         loaded is used."""
-        chosen = self.candidates[-1 if choice.at is None else choice.at]
+        chosen = self.candidates[-1 if choice.chosen is None else choice.chosen]
         try:
             return chosen, chosen.run(replace(problem, device=chosen.device_of(problem)), control)
         except LibraryError as error:
-            if choice.at is not None or len(self.candidates) == 1:
+            if choice.chosen is not None or len(self.candidates) == 1:
                 raise
             warnings.warn(f"{chosen.name} is not tried: {error}", stacklevel=2)
             return replace(self, candidates=self.candidates[:-1])._run_choice(choice, problem, control)
@@ -116,7 +116,7 @@ class Auto(Method):
             choice = trial.compare(self.candidates, self.least_gain)
         if trial.ended:
             return TrialChoice("stopped before the choice"), None
-        if choice.at is None:
+        if choice.chosen is None:
             raise ValueError("; ".join(each.remark for each in choice.predictions))
         return choice, trial
 

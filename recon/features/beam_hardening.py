@@ -91,11 +91,11 @@ def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tup
         raise NoCurveError(f"too few rays go through the material: {inside}, and {_FEWEST_RAYS} are needed")
     slope = float(p @ length / (length @ length))
 
-    def of(soft: float, hard: float, share: float) -> F64:
+    def curve_points(soft: float, hard: float, share: float) -> F64:
         return hard * length - np.log(share * np.exp(-(soft - hard) * length) + 1 - share)
 
     def residuals(x: F64) -> F64:
-        return np.asarray(of(x[0] + x[1], x[0], x[2]) - p)
+        return np.asarray(curve_points(x[0] + x[1], x[0], x[2]) - p)
 
     from scipy.optimize import least_squares  # loading takes half a second
 

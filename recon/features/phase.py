@@ -144,11 +144,11 @@ def length_by_held_out_views(
     height = min(TRIAL_ROWS, views.shape[1])
     first = round(min(max(geometry.axis_row - height / 2, 0), views.shape[1] - height))
     rows = slice(first, first + height) if geometry.is_cone else busiest_rows(views, height)
-    some = spread(np.arange(geometry.n_views), _VIEWS)
-    views, known = np.ascontiguousarray(views[some, rows]), known[rows]
-    geometry = geometry.select(some).rows(rows.start, rows.stop)
-    if matter := columns_of_matter(geometry, Grid.matching(geometry), views):
-        views, known, geometry = views[:, :, matter[0]], known[:, matter[0]], matter[1]
+    sampled = spread(np.arange(geometry.n_views), _VIEWS)
+    views, known = np.ascontiguousarray(views[sampled, rows]), known[rows]
+    geometry = geometry.select(sampled).rows(rows.start, rows.stop)
+    if material_columns := columns_of_matter(geometry, Grid.matching(geometry), views):
+        views, known, geometry = views[:, :, material_columns[0]], known[:, material_columns[0]], material_columns[1]
     method, grid = EarlyTv(_SWEEPS, _TV_WEIGHT), Grid.matching(geometry)
     weights = None if known.all() else np.broadcast_to(known.astype(np.float32), views.shape)
 
@@ -169,13 +169,13 @@ def length_by_held_out_views(
     if best is None or best.strength > _LONGEST:
         return None
     near = (_FIRST * 2.0 ** (round(math.log2(best.strength / _FIRST)) + half) for half in (-0.5, 0.0, 0.5))
-    at = min(near, key=lambda square: float(residuals_of(square).mean()))
-    least, none = residuals_of(at), residuals_of(0.0)
+    best_square = min(near, key=lambda square: float(residuals_of(square).mean()))
+    least, none = residuals_of(best_square), residuals_of(0.0)
     if not exceeds_standard_error(none - least, _ERRORS):
         return None
-    weaker, stronger = (residuals_of(at * 2.0**half) - least for half in (-0.5, 0.5))
+    weaker, stronger = (residuals_of(best_square * 2.0**half) - least for half in (-0.5, 0.5))
     # The search uses factors of √2, then the vertex of a parabola, for each projection. Factors of 2 would cost 1 dB.
     to_vertex = (weaker - stronger) / (2 * float((weaker + stronger).mean()))
     factor = 2.0 ** float(to_vertex.std(ddof=1) / (2 * math.sqrt(to_vertex.size)))
-    square, gain = at * 2.0 ** float(to_vertex.mean() / 2), 1 - float(least.mean() / none.mean())
+    square, gain = best_square * 2.0 ** float(to_vertex.mean() / 2), 1 - float(least.mean() / none.mean())
     return FilterLength(math.sqrt(square), factor, gain)

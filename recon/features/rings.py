@@ -273,8 +273,8 @@ def _far_off(sinogram: F32, axis_col: float) -> bool:
     strong = np.abs(cleaned - sinogram).max(axis=0) > 0.1 * max(float(np.ptp(np.median(sinogram, axis=0))), 1e-12)
     columns = np.arange(strong.size)
     across = np.rint(2 * axis_col - columns).astype(int)
-    seen = (across >= 0) & (across < strong.size)
-    mirrored = seen & maximum_filter1d(strong, 3)[np.clip(across, 0, strong.size - 1)]
+    inside = (across >= 0) & (across < strong.size)
+    mirrored = inside & maximum_filter1d(strong, 3)[np.clip(across, 0, strong.size - 1)]
     own = strong & ~mirrored & (np.abs(columns - axis_col) > AT_AXIS)
     return bool(own.any() and changed <= strong.size / 5)
 

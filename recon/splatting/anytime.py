@@ -158,8 +158,8 @@ def volume_error(rendered: F32, measured: F32) -> float:
 
 def direct_volume(images: Sequence[F32], geometry: Geometry, grid: Grid) -> F32:
     """FBP of at most 400 of the projections [row, col], with negative values set to zero, float32 [z, y, x]."""
-    some = spread_views(geometry.angles, _VIEWS, np.arange(len(images)))
-    return np.maximum(fbp(np.stack([images[i] for i in some]), geometry.select(some), grid, "hann"), 0)
+    view_numbers = spread_views(geometry.angles, _VIEWS, np.arange(len(images)))
+    return np.maximum(fbp(np.stack([images[i] for i in view_numbers]), geometry.select(view_numbers), grid, "hann"), 0)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from recon.splatting.problem import FitProblem
 from recon.splatting.settings import NAMES, FitSettings
 
 _GROUPS = ("parameters", "first", "second")
-_COUNTS = ("limit", "step", "seen")
+_COUNTS = ("limit", "step", "views_shown")
 _SCALARS = ("unit", "loss", "residual")
 _WORDS = 4  # 64-bit words for state and increment of PCG64
 
@@ -58,7 +58,7 @@ def state_from(arrays: Mapping[str, NDArray[Any]], backend: Backend[Any] | None 
     _refuse_damaged(arrays)
     device = backend or Cpu()
     parts = {group: {name: device.array(arrays[f"{group}.{name}"]) for name in NAMES} for group in _GROUPS}
-    limit, step, seen = (int(v) for v in arrays["counts"])
+    limit, step, views_shown = (int(v) for v in arrays["counts"])
     unit, loss, residual = (float(v) for v in arrays["scalars"])
     kernel = Kernel.of_exponent(float(arrays["kernel_exponent"]))
     words = [int(word) for word in arrays["generator"]]
@@ -71,7 +71,7 @@ def state_from(arrays: Mapping[str, NDArray[Any]], backend: Backend[Any] | None 
     }
     return FitState(
         parts["parameters"], parts["first"], parts["second"], device.array(arrays["statistic"]), unit, rng, limit,
-        kernel=kernel, step=step, drawn=arrays["drawn"].tolist(), seen=seen, loss=loss, residual=residual,
+        kernel=kernel, step=step, drawn=arrays["drawn"].tolist(), views_shown=views_shown, loss=loss, residual=residual,
     )  # fmt: skip
 
 
@@ -112,7 +112,7 @@ class HeldOutTracker:
     value: float = float("nan")
     best: float = float("inf")
     best_step: int = 0
-    kept: dict[str, NDArray[Any]] = field(default_factory=dict)
+    best_state: dict[str, NDArray[Any]] = field(default_factory=dict)
 
     @classmethod
     def over(
@@ -122,14 +122,14 @@ class HeldOutTracker:
         if problem is None or "watch" not in resume:
             return cls(problem, settings, best_step=step)
         best, best_step = resume["watch"]
-        kept = {name.removeprefix(_BEST): values for name, values in resume.items() if name.startswith(_BEST)}
-        return cls(problem, settings, best=float(best), best_step=int(best_step), kept=kept)
+        best_state = {name.removeprefix(_BEST): values for name, values in resume.items() if name.startswith(_BEST)}
+        return cls(problem, settings, best=float(best), best_step=int(best_step), best_state=best_state)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The tracker as arrays of a checkpoint."""
         if self.problem is None:
             return {}
-        best = {_BEST + name: values for name, values in self.kept.items()}
+        best = {_BEST + name: values for name, values in self.best_state.items()}
         return {"watch": np.array([self.best, self.best_step]), **best}
 
     def measure(self, state: FitState, keep: bool) -> None:
@@ -139,4 +139,4 @@ class HeldOutTracker:
         if self.value < self.best:
             self.best, self.best_step = self.value, state.step
             if keep:
-                self.kept = arrays_of(state, self.problem.backend)
+                self.best_state = arrays_of(state, self.problem.backend)

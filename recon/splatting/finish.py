@@ -168,19 +168,19 @@ def finish(
         beyond = beyond_voxels(gaussians, problem.geometry, volume.grid, fit)
     if beyond is not None:
         prepared = replace(prepared, data=prepared.data - beyond)
-    n_views, count, made, begin = problem.geometry.n_views, sweeps or FINISH_SWEEPS, 0, control.now()
+    n_views, count, completed, begin = problem.geometry.n_views, sweeps or FINISH_SWEEPS, 0, control.now()
     method = _Finish(count, sweeps is None)
 
     def on_sweep(number: int, residual: float) -> None:
-        nonlocal made
-        made = number
+        nonlocal completed
+        completed = number
         control.report_progress(number, method.planned, begin, n_views, "sweeps on voxels")
 
     refined = solve_views(
         method, projector, prepared, start=start, nonnegative=nonnegative,
         go_on=watched(control, n_views, PnpDct().trial_sweeps, on_sweep), decide=decide,
     )  # fmt: skip
-    return Finished(refined, min(count, made))
+    return Finished(refined, min(count, completed))
 
 
 def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> Views | None:

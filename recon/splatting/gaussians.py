@@ -48,8 +48,8 @@ class Gaussians:
         n = self.means.shape[0]
         for name, width in _PARAMETERS.items():
             expected = (n, *width)
-            if (found := tuple(getattr(self, name).shape)) != expected:
-                raise ValueError(f"{name} has shape {found}, expected {expected}")
+            if (shape := tuple(getattr(self, name).shape)) != expected:
+                raise ValueError(f"{name} has shape {shape}, expected {expected}")
         if not 0 < self.density_unit < float("inf"):
             raise ValueError(f"density_unit must be positive and finite, got {self.density_unit}")
 
@@ -105,8 +105,8 @@ class Gaussians:
 
     def select(self, index: Tensor) -> Gaussians:
         """The Gaussians at `index` (a mask or positions), as copies."""
-        some: dict[str, Any] = {name: getattr(self, name)[index] for name in _PARAMETERS}
-        return replace(self, **some)
+        selected: dict[str, Any] = {name: getattr(self, name)[index] for name in _PARAMETERS}
+        return replace(self, **selected)
 
     def widened(self, variance: float) -> Gaussians:
         """The same Gaussians, widened by adding `variance` (mm²) in every direction. Each Gaussian keeps its mass."""

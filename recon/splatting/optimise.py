@@ -48,7 +48,7 @@ class FitState:
     kernel: Kernel = Kernel.GAUSSIAN
     step: int = 0
     drawn: list[int] = field(default_factory=list)
-    seen: int = 0
+    views_shown: int = 0
     loss: Any = float("nan")
     residual: Any = float("nan")
     mean: dict[str, Any] | None = None
@@ -127,7 +127,7 @@ def step(
             StepInputs(problem.geometry, views, images, maps, weights, corner, of_variation, update.rates, state.step)
         )
         state.loss, state.residual = fused.loss, fused.residual
-    state.seen += len(views)
+    state.views_shown += len(views)
     if state.step % NORMALISE == 0:
         # A gradient is orthogonal to its quaternion, so every step makes the quaternion longer and the next rotation
         # smaller. Without normalisation, quaternions are twice as long after 30 000 steps.
@@ -229,12 +229,12 @@ def _by_operations(
     share = len(views)
     for view in views:
         target, weights = problem.images[view], problem.weights[view]
-        seen = run.view(geometry, view, cut.faint, cut.sigmas, settings.rays)
-        value, slope = problem.loss(seen.image, target, problem.target_maps[view], weights)
-        state.residual = _running(state.residual, backend.misfit(seen.image, target, weights))
+        rendered = run.view(geometry, view, cut.faint, cut.sigmas, settings.rays)
+        value, slope = problem.loss(rendered.image, target, problem.target_maps[view], weights)
+        state.residual = _running(state.residual, backend.misfit(rendered.image, target, weights))
         if share > 1:
             slope /= share
-        centres = seen.backward(slope)
+        centres = rendered.backward(slope)
         backend.add_lengths(centres, share * geometry.detector_shape[1] / 2, state.statistic)
         loss = loss + value / share  # type: ignore[operator]
     if box is not None:
@@ -312,7 +312,7 @@ def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
     backend = problem.backend
     p = {name: backend.numpy(state.parameters[name]) for name in NAMES}
     active = Active.of(p["means"], p["log_scales"], p["quaternions"], p["raw"], 1.0)
-    statistic = backend.numpy(state.statistic) / np.float32(max(1, state.seen))
+    statistic = backend.numpy(state.statistic) / np.float32(max(1, state.views_shown))
     change = control(
         (p["means"], p["log_scales"], active.rotations, p["raw"]), statistic, policy,
         2 * problem.half_field, state.limit, problem.grid.edges, state.rng,
@@ -336,4 +336,4 @@ def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
         for name in NAMES:
             moments[name] = backend.taken(moments[name], origin[order])
     state.statistic = backend.array(np.zeros(state.n, np.float32))
-    state.seen = 0
+    state.views_shown = 0

@@ -94,8 +94,8 @@ class R2(Fit):
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The residuals of the fit in the held-out projections. The test includes the voxel refinement if a number of
         steps ends the fit, but not if a time limit ends it."""
-        other = self.finish is not None or self.seconds is not None or isinstance(self.gaussians, Gaussians)
-        if other or self.early_stop or trial.prior is None:
+        by_other_settings = self.finish is not None or self.seconds is not None or isinstance(self.gaussians, Gaussians)
+        if by_other_settings or self.early_stop or trial.prior is None:
             return trial.predicted(self)
         weight = trial.early_weight
         return predict(self, trial, so_far, trial.prior if weight is None else trial.prior._replace(weight=weight))
@@ -142,8 +142,8 @@ class R2(Fit):
         return replace(self, steps=_TOY_STEPS, seconds=None, gaussians=_TOY_GAUSSIANS, early_stop=False, fit=fit)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        given = self.gaussians.n if isinstance(self.gaussians, Gaussians) else self.gaussians
-        count = given or default_count(geometry, grid.voxel_size)
+        requested = self.gaussians.n if isinstance(self.gaussians, Gaussians) else self.gaussians
+        count = requested or default_count(geometry, grid.voxel_size)
         grown = growth(self.fit) / DensityPolicy.growth
         of_gaussians = round(1000 * grown * min(count, math.prod(grid.shape)))
         refined = bytes_of(Buffers(10, 9, 9, filtered=True), geometry, grid, weighted)

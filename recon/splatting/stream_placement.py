@@ -125,7 +125,7 @@ def place_gaussians(
     learnt = [view for view in range(views.n) if all_views or not views.held_out[view]]
     reach = whole_reach(all_of)
     wider, used = reach.sample, replace(all_of, reach=reach).select(np.array(learnt))
-    geometry, seen = used.geometry, used.data
+    geometry, data = used.geometry, used.data
     box = plan.grid if wider is None else plan.grid.reaching(wider.radius, views.template)
     fitted = Grid.for_fit(views.template, box, wider=wider is not None)
     coarser = 2 ** max(0, math.ceil(math.log2(math.prod(fitted.shape) / _PLACED_FROM) / 3))
@@ -135,15 +135,15 @@ def place_gaussians(
     count = plan.count or default_count(views.template, fitted.voxel_size)
     kernel = plan.settings.kernel
     if known is None or geometry.is_cone:  # the first volume of a cone does not depend linearly on the data
-        volume = first_volume(seen, geometry, rough)
+        volume = first_volume(data, geometry, rough)
         gaussians = place(volume, used, count, rng, kernel=kernel)
     else:
         model, problem = averaged(known.state), known.problem
         rendered: F32 = np.stack(list(fit.renders(model, problem, plan.settings, learnt)))
-        left = first_volume(seen - rendered * problem.scale, geometry, rough)
-        volume = Volume(fit.volume_of(model, rough, views.template, plan.settings).data + left.data, rough)
+        residual = first_volume(data - rendered * problem.scale, geometry, rough)
+        volume = Volume(fit.volume_of(model, rough, views.template, plan.settings).data + residual.data, rough)
         radius = geometry.reach if wider is None else math.inf
         gaussians = sample_gaussians(volume, count, rng, field_radius=radius, kernel=kernel)
-        gaussians = scale_to_data(gaussians, seen, geometry)
+        gaussians = scale_to_data(gaussians, data, geometry)
     problem = fit.problem_of(all_of, fitted, gaussians.density_unit, plan.settings)
     return Placement(problem, fit.init(gaussians, rng))

@@ -74,9 +74,9 @@ class Waiting:
         """With other line integrals [row, col] of the newest projection."""
         return replace(self, images=(*self.images[:-1], image))
 
-    def with_images(self, images: F32, kept: NDArray[np.intp] | None) -> Waiting:
-        """With other line integrals [view, row, col] of projections `kept`; None: of all."""
-        views = self.views if kept is None else self.views.only(kept)
+    def with_images(self, images: F32, indices: NDArray[np.intp] | None) -> Waiting:
+        """With other line integrals [view, row, col] of projections `indices`; None: of all."""
+        views = self.views if indices is None else self.views.only(indices)
         return Waiting(views, tuple(images), self.rng)
 
     def cleared(self) -> Waiting:
@@ -179,8 +179,8 @@ class Growing:
         )  # fmt: skip
         return replace(self, problem=extend(others, image[None], angles[-1:]))
 
-    def with_images(self, images: F32, kept: NDArray[np.intp] | None) -> Growing | Waiting:
-        """With other line integrals [view, row, col] of projections `kept`; None: of all.
+    def with_images(self, images: F32, indices: NDArray[np.intp] | None) -> Growing | Waiting:
+        """With other line integrals [view, row, col] of projections `indices`; None: of all.
 
         If the line integrals differ by more than a fifth from those with which the Gaussians were placed, the model is
         dropped. If some projections are dropped, the learning rates start again, because the model was fitted to bad
@@ -189,12 +189,12 @@ class Growing:
         Raises:
             ValueError: a projection has no usable value.
         """
-        which = np.arange(self.views.n) if kept is None else kept
+        which = np.arange(self.views.n) if indices is None else indices
         views = self.views.only(which)
         if self._others(images, which):
             return Waiting(views, tuple(images), self.state.rng)
         problem = with_projections(replace(self.problem, geometry=views.geometry), images)
-        if kept is None:
+        if indices is None:
             return replace(self, problem=problem)
         self.state.drawn, self.state.mean = [], None
         return replace(
@@ -227,12 +227,12 @@ class Growing:
         for parameters in (state.parameters, state.mean):
             if parameters is not None:
                 parameters["means"][:, :2] -= shift
-        kept = 1 - min(1.0, abs(moved) / _AXIS_ANEW)
+        remaining = 1 - min(1.0, abs(moved) / _AXIS_ANEW)
         return replace(
             self,
             views=self.views.about(axis_col),
             problem=replace(self.problem, geometry=replace(self.problem.geometry, axis_col=axis_col)),
-            schedule_step=state.step - round(kept * (state.step - self.schedule_step)),
+            schedule_step=state.step - round(remaining * (state.step - self.schedule_step)),
         )
 
     def next_round(self, plan: StreamPlan) -> Growing:

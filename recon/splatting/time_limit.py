@@ -46,14 +46,14 @@ def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
     The time is measured with forward and back-projections of a few projections and one proximal step of total
     variation.
     """
-    some = geometry.select(np.arange(0, geometry.n_views, max(1, geometry.n_views // _SWEPT_VIEWS))[:_SWEPT_VIEWS])
-    projector = Projector(some, grid)
+    sampled = geometry.select(np.arange(0, geometry.n_views, max(1, geometry.n_views // _SWEPT_VIEWS))[:_SWEPT_VIEWS])
+    projector = Projector(sampled, grid)
     begin = now()
     x = projector.adjoint_lines(projector.forward_lines(np.ones((*grid.shape[1:], grid.shape[0]), np.float32)))
     projected = now()
     TotalVariationProx(x.shape, difference_weights(grid), True, TV_STEPS)(x, float(x.max()) / 100)
     parts = subsets_of(geometry, MANY_SUBSETS, to_the_end=False)
-    return (projected - begin) * geometry.n_views / some.n_views + (now() - projected) * parts
+    return (projected - begin) * geometry.n_views / sampled.n_views + (now() - projected) * parts
 
 
 def fill_seconds(gaussians: Gaussians, grid: Grid, now: Clock) -> float:
@@ -174,8 +174,8 @@ class FinalFit(Iterative):
             late = replace(control.by(end), decide=decide, stop_trials=None if plan.trials else lambda: True)
             if problem.wide:
                 # Gaussians from a fit during the scan do not determine the offset in the middle: -2 dB on grains.
-                made = FistaTv(half_voxels=False).run(problem, late)  # as its memory is stated
-                volume, sweeps = made.volume, len(made.history)
+                refined = FistaTv(half_voxels=False).run(problem, late)  # as its memory is stated
+                volume, sweeps = refined.volume, len(refined.history)
                 plan = plan._replace(sweeps=self.method.finish)
             else:
                 volume, sweeps = finish(volume, gaussians, problem, plan.sweeps, self.fit.settings, late)

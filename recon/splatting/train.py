@@ -57,7 +57,7 @@ class _FitViews:
         fitted: projections for the voxel refinement: all values finite, mean weight in the sample about 1.
         kept_back: the held-out projections in the same form; None: there are none.
         joined: factor by which pixels are binned for the fitting steps.
-        seen: geometry and data of the projections in the form that the fitting steps use.
+        step_views: geometry and data of the projections in the form that the fitting steps use.
         field: box of the Gaussians.
         count: number of Gaussians at the start.
     """
@@ -65,7 +65,7 @@ class _FitViews:
     fitted: ReconProblem
     kept_back: Views | None
     joined: int
-    seen: Views
+    step_views: Views
     field: Grid
     count: int
 
@@ -102,15 +102,15 @@ class _FitViews:
         joined = method.fit.joined_pixels or joined_for(
             pixel_grid, geometry.is_cone, max(count, usual), geometry.detector_shape
         )  # fmt: skip
-        seen = join_pixels(replace(measured, geometry=geometry), joined)
-        field = Grid.for_fit(seen.geometry, problem.grid, wider=problem.wide)
-        return cls(replace(problem, views=measured), kept_back, joined, seen, field, count)
+        step_views = join_pixels(replace(measured, geometry=geometry), joined)
+        field = Grid.for_fit(step_views.geometry, problem.grid, wider=problem.wide)
+        return cls(replace(problem, views=measured), kept_back, joined, step_views, field, count)
 
     def unseen(self, problem: FitProblem, settings: FitSettings, unit: float) -> FitProblem | None:
         """The held-out projections, prepared as those of the fitting steps."""
         if self.kept_back is None:
             return None
-        geometry = self.kept_back.geometry.at_row(0).seen_with(self.seen.geometry.width)
+        geometry = self.kept_back.geometry.at_row(0).seen_with(self.step_views.geometry.width)
         views = join_pixels(replace(self.kept_back, geometry=geometry), self.joined)
         return fit.problem_of(views, self.field, unit, settings, problem.backend)
 
@@ -191,12 +191,12 @@ class _Run:
         ).numpy()
         return Volume(filled, self.problem.grid), model
 
-    def report(self, at: float) -> None:
+    def report(self, now: float) -> None:
         state = self.state
         self.history.append(
             Progress(
-                state.step, self.length.steps or 0, at - self.begin, float(state.loss), float(state.residual), state.n,
-                self.views.seen.geometry.n_views, self.tracker.value,
+                state.step, self.length.steps or 0, now - self.begin, float(state.loss), float(state.residual), state.n,
+                self.views.step_views.geometry.n_views, self.tracker.value,
             )
         )  # fmt: skip
         self.control.tell(self.history[-1])
@@ -217,8 +217,8 @@ def run_fit(method: Fit, problem: ReconProblem, control: RunControl) -> Reconstr
     n_start = run.state.n
     _steps(run)
     last = run.state
-    if run.tracker.kept:
-        run.state = state_from(run.tracker.kept, run.fitting.backend)
+    if run.tracker.best_state:
+        run.state = state_from(run.tracker.best_state, run.fitting.backend)
     volume, model = run.model()
     volume, sweeps = _finished(run, volume, model)
     settings, state = run.settings, run.state
@@ -241,19 +241,22 @@ def _started(
     first = None
     if control.resume is None:
         if not isinstance(start, Gaussians):
-            first = first_volume(views.seen.data, views.seen.geometry, views.field, method.start, problem.device)
+            first = first_volume(
+                views.step_views.data, views.step_views.geometry, views.field, method.start, problem.device
+            )
             start = place(
-                first, views.seen, views.count, np.random.default_rng(problem.seed),
+                first, views.step_views, views.count, np.random.default_rng(problem.seed),
                 start=method.start, rays=settings.rays, kernel=settings.kernel,
             )  # fmt: skip
             first = first if method.start == "fbp" else None
         state = fit.init(start, problem.seed, growth(settings), backend)
     else:
         state = _resumed(control.resume, problem.geometry.n_views, backend)
-    fitting = fit.problem_of(views.seen, views.field, state.unit, settings, backend)
+    fitting = fit.problem_of(views.step_views, views.field, state.unit, settings, backend)
     if settings.tv_weight is None:
         change = decide(
-            "change", lambda: mean_change(views.seen.data, views.seen.geometry, views.field, first, problem.device)
+            "change",
+            lambda: mean_change(views.step_views.data, views.step_views.geometry, views.field, first, problem.device),
         )
         fitting = replace(fitting, change=change)
     unseen = views.unseen(fitting, settings, state.unit)

@@ -47,9 +47,9 @@ def predict(method: Fit, trial: Trial, so_far: TrialChoice, prior: Prior) -> Pre
     begin = trial.settings.now()
     tried = _Fit.of(method, trial, FIRST_SHARE)
     smooth, best = trial.smooth_residuals, so_far.least
-    left, remark = tried.refined(prior), ""
-    leads = best is None or significantly_better(trial.in_line_integrals(left), best, so_far.least_gain)
-    if so_far.least_gain > 0 and not leads and significantly_better(smooth, left, FAR_BEHIND):
+    residuals, remark = tried.refined(prior), ""
+    leads = best is None or significantly_better(trial.in_line_integrals(residuals), best, so_far.least_gain)
+    if so_far.least_gain > 0 and not leads and significantly_better(smooth, residuals, FAR_BEHIND):
         remark = (
             f"{method.name} stopped after {FIRST_SHARE:.0%} of its steps, because its residual was much larger than "
             f"that of total variation (a full test takes about {(trial.settings.now() - begin) / FIRST_SHARE:.2g} s; "
@@ -57,9 +57,9 @@ def predict(method: Fit, trial: Trial, so_far: TrialChoice, prior: Prior) -> Pre
         )
     elif not leads:
         tried = _Fit.of(method, trial, 1.0)
-        left = tried.refined(prior)
-    apart = tried.level_beyond > left.mean()
-    return trial.prediction(method.name, left, None if apart else prior, remark)
+        residuals = tried.refined(prior)
+    apart = tried.level_beyond > residuals.mean()
+    return trial.prediction(method.name, residuals, None if apart else prior, remark)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +86,9 @@ class _Fit:
         """
         views = trial.views_of(method)
         rows = views.geometry.detector_shape[0] / trial.scan.projector.geometry.detector_shape[0]
-        made = method.for_trial(rows, share).run(views, trial.control)
+        fit = method.for_trial(rows, share).run(views, trial.control)
         units, cols = trial.problem.units, trial.all_columns.cols
-        model, box = made.gaussians, made.volume.grid
+        model, box = fit.gaussians, fit.volume.grid
         assert isinstance(model, Gaussians)
 
         cut = reach_of(views.views).is_cut_by(box, views.geometry)
@@ -100,7 +100,7 @@ class _Fit:
             return times_power(np.ascontiguousarray(projection_lines(lines)[:, cols]), -units.integral)
 
         unseen = trial.all_columns.unseen.scaled(math.ldexp(1.0, units.length))
-        return cls(trial, trial.lines_of(made.volume), beyond(views.geometry), beyond(unseen))
+        return cls(trial, trial.lines_of(fit.volume), beyond(views.geometry), beyond(unseen))
 
     def refined(self, prior: Prior) -> F64:
         """Residuals [held-out projection] of the volume after refinement with total variation.
@@ -115,11 +115,11 @@ class _Fit:
 
     def _by(self, prior: Prior, strength: float) -> F64:
         def make(problem: VoxelProblem, x: F32) -> F32:
-            some = problem if self.beyond is None else replace(problem, data=problem.data - self.beyond)
-            return refine(some, x, TvWeight(prior.weight), strength, FINISH_SWEEPS)
+            remaining = problem if self.beyond is None else replace(problem, data=problem.data - self.beyond)
+            return refine(remaining, x, TvWeight(prior.weight), strength, FINISH_SWEEPS)
 
-        other = None if self.beyond_unseen is None else level_of(self.beyond_unseen)
-        return self.trial.residuals(self.trial.volume_by(make, self.start), other)
+        level = None if self.beyond_unseen is None else level_of(self.beyond_unseen)
+        return self.trial.residuals(self.trial.volume_by(make, self.start), level)
 
     @property
     def level_beyond(self) -> float:

@@ -69,15 +69,15 @@ def _ray_by_ray(columns: F32, cosines: F64, sines: F64, axis_cols: F64, x: F64, 
             view, c = columns[v], cosines[v]
             for j in range(j0, j1):
                 offset = y[j] * sines[v] + axis_cols[v] + 1.0
-                at = (j - j0) * _ACROSS
+                place = (j - j0) * _ACROSS
                 for i in range(i0, i1):
                     t = x[i] * c + offset
                     if t >= 0.5 and t <= cols + 0.5:
                         col = int(t)
                         upper = _f(t - col)
                         low, high = lanes.load(view, col, 0), lanes.load(view, col + 1, 0)
-                        lanes.store(sums, at, 0, lanes.load(sums, at, 0) + (low * (_f(1) - upper) + high * upper))
-                    at += 1
+                        lanes.store(sums, place, 0, lanes.load(sums, place, 0) + (low * (_f(1) - upper) + high * upper))
+                    place += 1
         for k in range(nz):
             for j in range(j0, j1):
                 for i in range(i0, i1):
@@ -97,20 +97,20 @@ def _runs(k: I32, n: int, fx: F64, fy: F64, shape: tuple[int, int], tiles: I32, 
 
     Fills tiles [run], and runs [run, (view, first point, end)], up to their lengths; returns the number of runs.
     """
-    across, found, last = shape[1] // _TILE, 0, -1
+    across, n_runs, last = shape[1] // _TILE, 0, -1
     for v in range(fx.size):
         period = 0
-        for at in range(k.size):
-            row, col = int(_cell(fy[v] * k[at], shape[0])), int(_cell(fx[v] * k[at], shape[1]))
-            tile, turn = (row // _TILE) * across + col // _TILE, math.floor(k[at] / n)
-            if at == 0 or tile != last or turn != period:
-                if found < len(runs):
-                    tiles[found], runs[found, 0], runs[found, 1] = tile, v, at
-                found += 1
+        for sample in range(k.size):
+            row, col = int(_cell(fy[v] * k[sample], shape[0])), int(_cell(fx[v] * k[sample], shape[1]))
+            tile, turn = (row // _TILE) * across + col // _TILE, math.floor(k[sample] / n)
+            if sample == 0 or tile != last or turn != period:
+                if n_runs < len(runs):
+                    tiles[n_runs], runs[n_runs, 0], runs[n_runs, 1] = tile, v, sample
+                n_runs += 1
                 last, period = tile, turn
-            if found <= len(runs):
-                runs[found - 1, 2] = at + 1
-    return found
+            if n_runs <= len(runs):
+                runs[n_runs - 1, 2] = sample + 1
+    return n_runs
 
 
 @njit(**OPTIONS)
@@ -142,11 +142,11 @@ def _spread(
             step_row, step_col = fy[v] * rows, fx[v] * cols
             row0 = _cell(fy[v] * k[first], rows) - ty * _TILE - step_row * k[first]
             col0 = _cell(fx[v] * k[first], cols) - tx * _TILE - step_col * k[first]
-            for at in range(first, runs[run, 2]):
-                re, im = turn[0] * gain[at], turn[1] * gain[at]
-                value = lanes.load(source, k[at] - period * n, 0)
+            for sample in range(first, runs[run, 2]):
+                re, im = turn[0] * gain[sample], turn[1] * gain[sample]
+                value = lanes.load(source, k[sample] - period * n, 0)
                 value = value * re + lanes.quarter_turn(value) * im
-                row, col = row0 + step_row * k[at], col0 + step_col * k[at]
+                row, col = row0 + step_row * k[sample], col0 + step_col * k[sample]
                 r, c = int(row), int(col)
                 wr, wc = table[int((row - r) * _STEPS)], table[int((col - c) * _STEPS)]
                 for i in range(_REACH):
@@ -221,10 +221,10 @@ def gridding(angles: F64, axis_cols: F64, cols: int, x: F64, y: F64, response: C
     fx, fy = cosines * step / n, sines * step / n
     room = angles.size * k.size // 8 + 1024
     tiles, runs = np.empty(room, np.int32), np.empty((room, 3), np.int32)
-    if (found := _runs(k, n, fx, fy, plane, tiles, runs)) > room:
-        tiles, runs = np.empty(found, np.int32), np.empty((found, 3), np.int32)
+    if (n_runs := _runs(k, n, fx, fy, plane, tiles, runs)) > room:
+        tiles, runs = np.empty(n_runs, np.int32), np.empty((n_runs, 3), np.int32)
         _runs(k, n, fx, fy, plane, tiles, runs)
-    tiles, runs = tiles[:found], runs[:found]
+    tiles, runs = tiles[:n_runs], runs[:n_runs]
     ends = np.searchsorted(np.sort(tiles), np.arange(plane[0] * plane[1] // _TILE**2 + 1)).astype(np.int32)
     runs = runs[np.argsort(tiles, kind="stable")]
     return Gridding(

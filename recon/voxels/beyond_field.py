@@ -90,9 +90,9 @@ class _Outside:
     field: tuple[slice, ...]
 
     def __call__(self, views: Geometry) -> F32:
-        matter = np.maximum(self.whole, 0)
-        matter[self.field] = 0
-        return Projector(views, self.box).forward(matter)
+        outside = np.maximum(self.whole, 0)
+        outside[self.field] = 0
+        return Projector(views, self.box).forward(outside)
 
 
 def reach_of(views: Views) -> Reach:
@@ -100,19 +100,19 @@ def reach_of(views: Views) -> Reach:
     return views.reach or Reach(edges_of(views), _is_tall(views))
 
 
-def whole_reach(views: Views, given: float | SampleRadius | None = None) -> Reach:
+def whole_reach(views: Views, sample_radius: float | SampleRadius | None = None) -> Reach:
     """`reach_of` with the radius of the sample, which is measured unless the projections state it.
 
     Args:
-        given: the radius in mm if it is known.
+        sample_radius: the radius in mm if it is known.
 
     Raises:
         ValueError: the given radius is not a length.
     """
     reach = reach_of(views)
-    if reach.measured and given is None:
+    if reach.measured and sample_radius is None:
         return reach
-    sample = _radius_of(views) if given is None else _given_radius(given, views.geometry.reach)
+    sample = _radius_of(views) if sample_radius is None else _given_radius(sample_radius, views.geometry.reach)
     return replace(reach, sample=sample, measured=True)
 
 
@@ -150,8 +150,8 @@ def _radius_of(views: Views) -> SampleRadius | None:
     geometry = views.geometry
     own, reach = geometry.is_centred, geometry.reach
     used = np.flatnonzero(own)
-    some = np.union1d(spread_views(geometry.angles[used], _VIEWS, used), np.flatnonzero(~own))
-    if (measured := _some_rows(views, some)) is None or not edges_of(measured).beyond(0.0):
+    sampled_views = np.union1d(spread_views(geometry.angles[used], _VIEWS, used), np.flatnonzero(~own))
+    if (measured := _some_rows(views, sampled_views)) is None or not edges_of(measured).beyond(0.0):
         return None
     ordinary = measured.select(np.flatnonzero(measured.geometry.is_centred))
     if ordinary.geometry.n_views < LEAST_VIEWS:
@@ -180,14 +180,15 @@ def _middle_density(volume: Volume, reach: float) -> float:
     return float(volume.data[:, np.hypot(y, x) < reach / 2].mean())
 
 
-def _given_radius(given: float | SampleRadius, reach: float) -> SampleRadius | None:
-    if isinstance(given, SampleRadius):
-        return given
-    if not 0 <= given < math.inf:
+def _given_radius(sample_radius: float | SampleRadius, reach: float) -> SampleRadius | None:
+    if isinstance(sample_radius, SampleRadius):
+        return sample_radius
+    if not 0 <= sample_radius < math.inf:
         raise ValueError(
-            f"sample_radius must be a finite length in mm (0: the sample is within the field of view), got {given}"
+            "sample_radius must be a finite length in mm (0: the sample is within the field of view), "
+            f"got {sample_radius}"
         )
-    return SampleRadius(given, given, given, 0.0) if given > reach else None
+    return SampleRadius(sample_radius, sample_radius, sample_radius, 0.0) if sample_radius > reach else None
 
 
 def _predicting_radius(views: Views, reach: float) -> SampleRadius | None:
@@ -259,10 +260,12 @@ def _factor(geometry: Geometry, columns: int) -> int:
     return max(1, min(rows, math.ceil(cols / columns)))
 
 
-def _some_rows(whole: Views, some: NDArray[np.intp]) -> Views | None:
+def _some_rows(whole: Views, sampled_views: NDArray[np.intp]) -> Views | None:
     """The measured projections, in the rows with the most material (cone: the middle rows); None: there are none."""
-    geometry = whole.geometry.select(some)
-    look = np.nan_to_num(whole.data[some[:: max(1, len(some) // _LOOKS)]], nan=0.0, posinf=0.0, neginf=0.0)
+    geometry = whole.geometry.select(sampled_views)
+    look = np.nan_to_num(
+        whole.data[sampled_views[:: max(1, len(sampled_views) // _LOOKS)]], nan=0.0, posinf=0.0, neginf=0.0
+    )
     height = _ROWS * _factor(geometry, _COLS)
     rows = slice(0, geometry.detector_shape[0])
     if not geometry.is_cone:
@@ -270,14 +273,14 @@ def _some_rows(whole: Views, some: NDArray[np.intp]) -> Views | None:
         geometry = geometry.rows(rows.start, rows.stop)
     elif (middle := middle_of_cone(geometry, Grid.matching(geometry), look, height)) is not None:
         rows, geometry = middle[:2]
-    views = np.stack([whole.data[view, rows] for view in some])
+    views = np.stack([whole.data[view, rows] for view in sampled_views])
     known = np.isfinite(views)
     if whole.weights is not None:
-        known &= np.stack([whole.weights[view, rows] for view in some]) > 0
-    if not (seen := np.flatnonzero(known.any(axis=(1, 2)))).size:
+        known &= np.stack([whole.weights[view, rows] for view in sampled_views]) > 0
+    if not (measured_views := np.flatnonzero(known.any(axis=(1, 2)))).size:
         return None
-    filled, _ = masked(views[seen], known[seen].astype(np.float32))
-    return Views(filled, geometry.select(seen))
+    filled, _ = masked(views[measured_views], known[measured_views].astype(np.float32))
+    return Views(filled, geometry.select(measured_views))
 
 
 @dataclass(frozen=True, eq=False)

@@ -55,10 +55,10 @@ def predicts_as_well(residuals: F64, best: F64) -> bool:
     return not exceeds_standard_error(residuals - best, _ERRORS)
 
 
-def significantly_better(residuals: F64, other: F64, least_gain: float) -> bool:
+def significantly_better(residuals: F64, reference_residuals: F64, least_gain: float) -> bool:
     """Whether residuals [held-out view] are lower than others by the share `least_gain` and by more than chance."""
-    by_more = float(residuals.mean()) < (1 - least_gain) * float(other.mean())
-    return by_more and exceeds_standard_error(other - residuals, _ERRORS)
+    by_more = float(residuals.mean()) < (1 - least_gain) * float(reference_residuals.mean())
+    return by_more and exceeds_standard_error(reference_residuals - residuals, _ERRORS)
 
 
 class Prediction(NamedTuple):
@@ -108,8 +108,10 @@ class TrialChoice(NamedTuple):
 
         A candidate whose residual is not finite was stopped or diverged, and counts as not tried.
         """
-        given = {number: each.residuals for number, each in enumerate(self.predictions) if each.residuals is not None}
-        return {number: np.asarray(residuals) for number, residuals in given.items() if np.isfinite(residuals).all()}
+        measured = {
+            number: each.residuals for number, each in enumerate(self.predictions) if each.residuals is not None
+        }
+        return {number: np.asarray(residuals) for number, residuals in measured.items() if np.isfinite(residuals).all()}
 
     @property
     def best(self) -> int | None:
@@ -131,7 +133,7 @@ class TrialChoice(NamedTuple):
         return any(each.prior and each.prior.materials and each.prior.materials.levels for each in self.predictions)
 
     @property
-    def at(self) -> int | None:
+    def chosen(self) -> int | None:
         """Number of the simplest candidate that the best one does not beat significantly; None: none was tried."""
         if (least := self.least) is None:
             return None
@@ -154,7 +156,7 @@ class TrialChoice(NamedTuple):
     @property
     def prior(self) -> Prior | None:
         """The prior of the chosen candidate."""
-        return None if self.at is None else self.predictions[self.at].prior
+        return None if self.chosen is None else self.predictions[self.chosen].prior
 
     @property
     def reason(self) -> str:
@@ -163,20 +165,20 @@ class TrialChoice(NamedTuple):
         These residuals are those of weighted rays. The data residual in reports is something else: a share of the norm
         of the projections.
         """
-        if self.at is None:
+        if self.chosen is None:
             return self.where
-        given = [(each.name, np.mean(each.residuals)) for each in self.predictions if each.residuals is not None]
-        listed = [f"{name} {mean:#.4g}" for name, mean in given]
+        means = [(each.name, np.mean(each.residuals)) for each in self.predictions if each.residuals is not None]
+        listed = [f"{name} {mean:#.4g}" for name, mean in means]
         remarks = [each.remark for each in self.predictions if each.remark]
         return f"test reconstructions of {self.where}, {MEASURE}: {'; '.join([*listed, *remarks])}{self._of_the_best}"
 
     @property
     def _of_the_best(self) -> str:
         """By how much the best candidate is better than the simpler chosen one; empty if the best one was chosen."""
-        if self.at is None or self.best is None or self.at == self.best:
+        if self.chosen is None or self.best is None or self.chosen == self.best:
             return ""
         (simple, of_simple), (best, of_best) = (
-            (self.predictions[number].name, self.tried[number]) for number in (self.at, self.best)
+            (self.predictions[number].name, self.tried[number]) for number in (self.chosen, self.best)
         )
         improvement, error = (
             (of_simple - of_best).mean() / of_simple.mean(),

@@ -64,15 +64,17 @@ class Damping:
         rows, cols = (cells_of(n, self.width) for n in self.shape[:2])
         down = np.fft.fftfreq(rows) * rows
         across = np.fft.rfftfreq(cols) * cols
-        given = ((down, rows), (across, cols))
-        kept = [
+        axes = ((down, rows), (across, cols))
+        spectra = [
             np.maximum(spectrum_of_tents(f.astype(np.float64), n * self.width, self.width), _LEAST_OF_TENTS)
-            for f, n in given
+            for f, n in axes
         ]
         side = max(rows, cols)
         cycles = np.hypot(down[:, None] * side / rows, across[None] * side / cols)
         transfer = 1 - np.clip(cycles / _UNDAMPED, 1, self.gain) / self.gain
-        transfer = np.minimum(transfer / (kept[0][:, None] * kept[1][None]), 1 - 1 / self.gain)  # L must stay below 1
+        transfer = np.minimum(
+            transfer / (spectra[0][:, None] * spectra[1][None]), 1 - 1 / self.gain
+        )  # L must stay below 1
         return (transfer / self.width**2).astype(np.float32)
 
     def cells(self, device: VoxelDevice[Any], x: Any) -> Any:

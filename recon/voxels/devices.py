@@ -154,8 +154,8 @@ class _GpuProjector:
 
     def adjoint_lines(self, projections: Any, out: Any = None) -> Any:
         if not self._moments:
-            found = self._device.array(self._projector.adjoint_lines(self._device.numpy(projections)))
-            return found if out is None else out.copy_(found)
+            volume = self._device.array(self._projector.adjoint_lines(self._device.numpy(projections)))
+            return volume if out is None else out.copy_(volume)
         nz, ny, nx = self._projector.grid.shape
         out = self._device.zeros((ny, nx, nz)) if out is None else out
         return self._mean(self._joseph.adjoint, self._spread(projections), out)

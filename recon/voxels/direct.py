@@ -61,8 +61,11 @@ def _along_columns(
                     if base >= 0.5 and base <= rows + 0.5:
                         row = math.floor(base)
                         a, b = filtered[v, low], filtered[v, low + 1]
-                        one, other = a[row] + part * (b[row] - a[row]), a[row + 1] + part * (b[row + 1] - a[row + 1])
-                        out[j, i, 0] += share * (one + _f(base - row) * (other - one))
+                        value, next_value = (
+                            a[row] + part * (b[row] - a[row]),
+                            a[row + 1] + part * (b[row + 1] - a[row + 1]),
+                        )
+                        out[j, i, 0] += share * (value + _f(base - row) * (next_value - value))
                     continue
                 first = math.ceil(max((0.5 - base) / climb, 0.0))
                 end = math.floor(min((rows + 0.5 - base) / climb, nz - 1.0)) + 1
@@ -78,9 +81,9 @@ def _along_columns(
                 target = out[j, i, first:end]
                 start, rise = _f(base + climb * first - r0), _f(climb)
                 for k in range(target.size):
-                    at = start + rise * _f(k)
-                    whole = np.int32(at)
-                    target[k] += near[whole] + (at - _f(whole)) * (near[whole + 1] - near[whole])
+                    position = start + rise * _f(k)
+                    whole = np.int32(position)
+                    target[k] += near[whole] + (position - _f(whole)) * (near[whole + 1] - near[whole])
 
 
 def fdk(
@@ -88,7 +91,7 @@ def fdk(
     geometry: Geometry,
     grid: Grid | None = None,
     filter: Filter = "ram-lak",
-    on_block: Callable[[int, int], None] = lambda done, of: None,
+    on_block: Callable[[int, int], None] = lambda done, total: None,
 ) -> NDArray[np.float32]:
     """Reconstruct a cone-beam scan (Feldkamp, Davis & Kress 1984, J. Opt. Soc. Am. A 1, 612); projections in any order.
 
@@ -159,9 +162,9 @@ def _by_slabs(
     volume = compute_device.zeros((y.size, x.size, z.size))
     slab = max(1, SLAB_BYTES // (4 * math.prod(geometry.detector_shape)))
     for start in range(0, geometry.n_views, slab):
-        some = slice(start, start + slab)
-        part = geometry.select(some)
-        prepared, of_views = prepare(projections[some], part, weights[some], zeros, beyond)
+        slab_views = slice(start, start + slab)
+        part = geometry.select(slab_views)
+        prepared, of_views = prepare(projections[slab_views], part, weights[slab_views], zeros, beyond)
         # the filter would spread NaN and infinite values; works on any device
         if not math.isfinite(float(prepared.max()) - float(prepared.min())):
             raise ValueError("projections contain NaN or infinite values; correct them before the reconstruction")
@@ -239,7 +242,7 @@ def posed_direct(
     geometry: Geometry,
     grid: Grid,
     filter: Filter = "ram-lak",
-    on_block: Callable[[int, int], None] = lambda done, of: None,
+    on_block: Callable[[int, int], None] = lambda done, total: None,
     device: str = "cpu",
 ) -> F32:
     """Reconstruct rolled and tilted projections [view, row, col]; arguments, result and errors as for `fbp` and `fdk`.
@@ -349,8 +352,8 @@ class Fbp(Direct):
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         views, (rows, cols) = geometry.n_views, geometry.detector_shape
-        beside = fbp_memory(views, max(cols, grid.shape[2]))
-        return 4 * (math.prod(grid.shape) + 2 * weighted * views * rows * cols) + beside
+        fbp_buffers = fbp_memory(views, max(cols, grid.shape[2]))
+        return 4 * (math.prod(grid.shape) + 2 * weighted * views * rows * cols) + fbp_buffers
 
 
 def direct(
@@ -358,7 +361,7 @@ def direct(
     geometry: Geometry,
     grid: Grid,
     filter: Filter = "ram-lak",
-    on_block: Callable[[int, int], None] = lambda done, of: None,
+    on_block: Callable[[int, int], None] = lambda done, total: None,
     out: F32 | None = None,
     device: str = "cpu",
 ) -> F32:

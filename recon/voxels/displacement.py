@@ -301,6 +301,6 @@ def _apart(geometry: Geometry, views: NDArray[np.integer], others: NDArray[np.in
 
 def _without_smooth(images: F32, weight: F32) -> F32:
     """Differences from the surroundings along the row, for rays with a weight above 0."""
-    seen = images * weight
-    smooth = gaussian_filter1d(seen, SMOOTH, axis=2) / np.maximum(gaussian_filter1d(weight, SMOOTH, axis=2), 1e-3)
-    return np.asarray((seen - smooth * weight), np.float32)
+    weighted = images * weight
+    smooth = gaussian_filter1d(weighted, SMOOTH, axis=2) / np.maximum(gaussian_filter1d(weight, SMOOTH, axis=2), 1e-3)
+    return np.asarray((weighted - smooth * weight), np.float32)

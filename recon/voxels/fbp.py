@@ -91,14 +91,14 @@ def continuation(
         air. Also the weights [view, 1 + col + 1] of `ray_weights`. If a row is extrapolated and one edge is only a few
         columns farther out, which is too short for a transition of the shares, all columns have the share at the axis.
     """
-    cols, axes, given = mean.shape[1], geometry.axis_col + geometry.offsets[:, 0], weights
+    cols, axes, input_weights = mean.shape[1], geometry.axis_col + geometry.offsets[:, 0], weights
     edges = np.array([(axis := float(axes.mean())) + 0.5, cols - 0.5 - axis])
     if not geometry.is_cone and np.abs(2 * axes + 1 - cols).max() <= _FEW:
         weights = np.repeat(weights[:, round(axis) + 1, None], cols + 2, axis=1)
     cut = ends_in_matter(mean) & weights[:, (0, -1)].any(axis=0)
     cut_rows = np.flatnonzero(cut.any(axis=1))
     if not cut_rows.size:
-        return None, given
+        return None, input_weights
     filtered = np.zeros((len(mean), 2, cols + sum(zeros)), np.float32)
     ends = sample_reach(mean, axis)
     for row in cut_rows:
@@ -236,10 +236,10 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
 
 def _shares_of(plan: FbpPlan, rows: F64, shares: F64) -> F32:
     """Weights of the rays of some slices, float32 [view, slice or 1, 1 + col + 1]."""
-    seen = seen_by(plan.geometry, rows)
-    if seen.all():
+    covered = seen_by(plan.geometry, rows)
+    if covered.all():
         return plan.share
-    weights = [slice_weights(plan.geometry, some, shares) for some in seen.T]
+    weights = [slice_weights(plan.geometry, covered_views, shares) for covered_views in covered.T]
     return np.stack(weights, axis=1).astype(np.float32)
 
 
@@ -269,7 +269,7 @@ def fbp(
     geometry: Geometry,
     grid: Grid | None = None,
     filter: Filter = "ram-lak",
-    on_block: Callable[[int, int], None] = lambda done, of: None,
+    on_block: Callable[[int, int], None] = lambda done, total: None,
     out: F32 | None = None,
 ) -> F32:
     """Reconstruct by filtered back-projection (Kak & Slaney 1988, §3.3); projections in any order.

@@ -79,14 +79,14 @@ def edges_of(views: Views) -> FieldEdges:
         return FieldEdges({}, 0.0)
     numbers = spread(np.arange(own.size), _VIEWS)
     part = np.ix_(own[numbers], np.arange(0, views.data.shape[1], max(1, views.data.shape[1] // _ROWS)))
-    some = views.data[part]
-    known = np.isfinite(some) & (views.weights is None or views.weights[part] > 0)
+    sampled = views.data[part]
+    known = np.isfinite(sampled) & (views.weights is None or views.weights[part] > 0)
     if not known.any():
         return FieldEdges({}, 0.0)
-    some = np.where(known, some, np.nan)
-    mass = np.maximum(np.nan_to_num(some).mean(axis=(0, 2)), 0)
-    some = some[:, mass >= _FULL * mass.max()]
-    edges = {"left": some[..., :width], "right": some[..., -width:]}
+    sampled = np.where(known, sampled, np.nan)
+    mass = np.maximum(np.nan_to_num(sampled).mean(axis=(0, 2)), 0)
+    sampled = sampled[:, mass >= _FULL * mass.max()]
+    edges = {"left": sampled[..., :width], "right": sampled[..., -width:]}
     if geometry.is_off_middle and covers_the_circle(geometry.angles):
         far = "right" if geometry.axis_col < (cols - 1) / 2 else "left"
         edges = {far: edges[far]}
@@ -95,9 +95,9 @@ def edges_of(views: Views) -> FieldEdges:
         for side, values in edges.items()
     }
     of_views = {side: np.array([_median(view) for view in values]) for side, values in edges.items()}
-    some = np.nan_to_num(some)
-    cut = ends_in_matter(some.mean(axis=0))[:, [int(side == "right") for side in edges]]
-    return FieldEdges(levels, float(np.median(some.mean(axis=(1, 2)))), of_views, numbers, bool(cut.any()))
+    sampled = np.nan_to_num(sampled)
+    cut = ends_in_matter(sampled.mean(axis=0))[:, [int(side == "right") for side in edges]]
+    return FieldEdges(levels, float(np.median(sampled.mean(axis=(1, 2)))), of_views, numbers, bool(cut.any()))
 
 
 def _median(values: F32) -> float:
@@ -167,8 +167,8 @@ def middle_of_cone(geometry: Geometry, grid: Grid, data: F32, height: int) -> tu
     rows = slice(first, first + height)
     if (around and np.abs(off).max() > 1) or first < 0 or rows.stop > geometry.detector_shape[0]:
         return None
-    some = data[:: max(1, len(data) // 8)]
-    if np.abs(some[:, rows]).sum() < ENOUGH_MATTER * np.abs(some[:, busiest_rows(some, height)]).sum():
+    sampled = data[:: max(1, len(data) // 8)]
+    if np.abs(sampled[:, rows]).sum() < ENOUGH_MATTER * np.abs(sampled[:, busiest_rows(sampled, height)]).sum():
         return None
     # at the far side of the field of view
     climb = 0.0 if around else float(np.ptp(off))
@@ -184,7 +184,7 @@ def busiest_rows(data: F32, height: int) -> slice:
     rows = data.shape[1]
     if rows <= height:
         return slice(0, rows)
-    some = data[:: max(1, len(data) // 8)]
-    cumulative = np.concatenate(([0.0], np.cumsum(np.abs(some).sum(axis=(0, 2), dtype=np.float64))))
+    sampled = data[:: max(1, len(data) // 8)]
+    cumulative = np.concatenate(([0.0], np.cumsum(np.abs(sampled).sum(axis=(0, 2), dtype=np.float64))))
     first = int(np.argmax(cumulative[height:] - cumulative[:-height]))
     return slice(first, first + height)

@@ -50,6 +50,6 @@ def predicted_views(
     They are chosen as in `split_views`, but with a period of 360° for every geometry, so that geometries are compared
     with the same projections.
     """
-    seen, unseen = split_views(views.geometry, one_in, 2 * np.pi)
-    volume = method.run(ReconProblem(views.select(seen), grid), RunControl(decide=decide)).volume
-    return unseen, Projector(views.geometry.select(unseen), grid).forward(volume.data)
+    fitted, held_out = split_views(views.geometry, one_in, 2 * np.pi)
+    volume = method.run(ReconProblem(views.select(fitted), grid), RunControl(decide=decide)).volume
+    return held_out, Projector(views.geometry.select(held_out), grid).forward(volume.data)

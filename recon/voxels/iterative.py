@@ -62,8 +62,8 @@ def watched(
         if control.stop_of_trials():
             return False
         done = next(count)
-        of, words = (usual_trials, "as a rule") if done <= usual_trials else (max(done, most), "at most")
-        control.report_progress(done, of, begin, n_views, f"{SWEEPS_OF_TRIALS} {words}")
+        total, words = (usual_trials, "as a rule") if done <= usual_trials else (max(done, most), "at most")
+        control.report_progress(done, total, begin, n_views, f"{SWEEPS_OF_TRIALS} {words}")
         return True
 
     def iteration(number: int, residual: float) -> bool:

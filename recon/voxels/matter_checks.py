@@ -85,12 +85,12 @@ def stray_mass(volume: Volume, views: Views) -> StrayMass | None:
         views = views.rows(band)
         volume = Volume(np.ascontiguousarray(volume.data[band]), Grid.matching(views.geometry))
     empty, by_all = seen_empty(views, volume.grid)
-    matter = np.maximum(volume.data, 0)
-    positive = matter[matter > 0]
+    densities = np.maximum(volume.data, 0)
+    positive = densities[densities > 0]
     if not empty.any() or not positive.size:
         return None
-    stray = np.where(empty & (matter > _FAINT * np.percentile(positive, _MATTER)), matter, 0)
-    share = float(stray.sum(dtype=np.float64) / matter.sum(dtype=np.float64))
+    stray = np.where(empty & (densities > _FAINT * np.percentile(positive, _MATTER)), densities, 0)
+    share = float(stray.sum(dtype=np.float64) / densities.sum(dtype=np.float64))
     return StrayMass(share, stray.max(axis=0), first, empty & by_all)
 
 
@@ -132,12 +132,12 @@ def seen_empty(views: Views, grid: Grid) -> tuple[Mask, Mask]:
         air = gaussian_filter(image, _BLUR) < limit
         if known is not None:
             air &= known[view] > 0
-        one = Projector(geometry.select([view]), grid)
-        through_all = one.adjoint(np.ones((1, *air.shape), np.float32))
+        projector = Projector(geometry.select([view]), grid)
+        through_all = projector.adjoint(np.ones((1, *air.shape), np.float32))
         by_all &= through_all > 0
         if not air.any():
             continue
-        through_air = one.adjoint(air[None].astype(np.float32))
+        through_air = projector.adjoint(air[None].astype(np.float32))
         votes += (through_all > 0) & (through_air >= np.float32(_WHOLE) * through_all)
     return votes >= _AGREE, by_all
 
@@ -173,7 +173,7 @@ class Unexplained:
     significance: F32
 
 
-def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> RayCheck[Unexplained | None]:
+def unexplained(volume: Volume, views: Views, rng: np.random.Generator) -> RayCheck[Unexplained | None]:
     """Filtered back-projection of the residual p - A x, divided by its noise (measured with random signs).
 
     If projections get random signs, structure cancels because all projections share it, and noise remains (our own
@@ -183,14 +183,14 @@ def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> RayChe
 
     Args:
         volume: the volume on the slices of the detector rows, 1/mm.
-        seen: the projections.
+        views: the projections.
 
     Returns:
         The check. Its result is None for a cone, rolled or tilted projections, fewer than 16 projections, other slices,
         or a volume without material.
     """
     nothing: RayCheck[Unexplained | None] = RayCheck((), lambda: None)
-    geometry, slices = seen.geometry, volume.grid.shape[0]
+    geometry, slices = views.geometry, volume.grid.shape[0]
     rows_differ = geometry.is_cone or not geometry.is_straight or volume.grid != Grid.matching(geometry)
     if rows_differ or geometry.n_views < _LEAST_VIEWS:
         return nothing
@@ -199,23 +199,23 @@ def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> RayChe
     middle = round(float(mass @ np.arange(slices) / mass.sum())) if mass.any() else 0
     first = min(max(middle - n // 2, 0), slices - n)
     if geometry.climbs:  # few projections see the slices between the ends
-        at = volume.grid.coordinates()[0] / geometry.pixel_pitch + geometry.axis_row
-        first = int(np.convolve(mass * seen_by(geometry, at).sum(axis=0), np.ones(n), "valid").argmax())
+        slice_rows = volume.grid.coordinates()[0] / geometry.pixel_pitch + geometry.axis_row
+        first = int(np.convolve(mass * seen_by(geometry, slice_rows).sum(axis=0), np.ones(n), "valid").argmax())
     rows, _, box = part_of(geometry, volume.grid, slice(first, first + n))
     part = Volume(np.ascontiguousarray(volume.data[first : first + n]), box)
     level = _DENSE * float(np.percentile(part.data, 99))
-    matter = np.stack([ndimage.binary_closing(image > level, iterations=_CLOSED) for image in part.data])
-    if level <= 0 or not matter.any():
+    material = np.stack([ndimage.binary_closing(image > level, iterations=_CLOSED) for image in part.data])
+    if level <= 0 or not material.any():
         return nothing
-    shown, model = seen.rows(rows), list[F32]()
+    shown, model = views.rows(rows), list[F32]()
     parts = [AskedRays(np.arange(geometry.n_views), rows, lambda lines: model.append(projection_images(lines)))]
     if not in_bands(geometry, volume.grid):  # the rows also show other slices, so these slices are projected alone
         parts, model = [], [Projector(shown.geometry, box).forward(part.data)]
-    return RayCheck(parts, lambda: _structure(shown, model[0], part, first, matter, rng))
+    return RayCheck(parts, lambda: _structure(shown, model[0], part, first, material, rng))
 
 
 def _structure(
-    shown: Views, model: F32, part: Volume, first: int, matter: Mask, rng: np.random.Generator
+    shown: Views, model: F32, part: Volume, first: int, material: Mask, rng: np.random.Generator
 ) -> Unexplained:
     """Compute the result of `unexplained` for the slices from `first` on, whose projection is `model` [view, row,
     col].
@@ -225,21 +225,21 @@ def _structure(
     if shown.weights is not None:
         unseen = unseen | (shown.weights == 0)
     lines = np.where(unseen, np.float32(0), shown.data).swapaxes(1, 2)  # at the resolution of voxels, like the model
-    left = at_voxel_resolution(lines, ViewResolution.of(geometry, box), ~unseen.swapaxes(1, 2)).swapaxes(1, 2)
-    left = left - model
-    left[unseen] = 0
-    left -= ring_offsets(left, geometry)
-    left[unseen] = 0
+    residual = at_voxel_resolution(lines, ViewResolution.of(geometry, box), ~unseen.swapaxes(1, 2)).swapaxes(1, 2)
+    residual = residual - model
+    residual[unseen] = 0
+    residual -= ring_offsets(residual, geometry)
+    residual[unseen] = 0
 
-    signs = np.where(np.arange(len(left)) % 2, np.float32(1), np.float32(-1))
+    signs = np.where(np.arange(len(residual)) % 2, np.float32(1), np.float32(-1))
     kinds = np.stack([np.ones_like(signs), *(rng.permutation(signs) for _ in range(_FLIPS))])
-    first_kind, *flipped = _fbp_of_each(left, kinds, geometry, box)
-    found, variance = _smoothed(first_kind), np.zeros(box.shape, np.float32)
+    first_kind, *flipped = _fbp_of_each(residual, kinds, geometry, box)
+    averaged, variance = _smoothed(first_kind), np.zeros(box.shape, np.float32)
     for images in flipped:
         variance += _smoothed(images) ** 2 / _FLIPS
     noise = np.sqrt(gaussian_filter(variance, (0, _AROUND, _AROUND)))
-    significance = np.divide(found, noise, out=np.zeros_like(found), where=noise > 0)
-    return Unexplained(float(np.mean(np.abs(significance[matter]) > _SIGNIFICANT)), first, significance)
+    significance = np.divide(averaged, noise, out=np.zeros_like(averaged), where=noise > 0)
+    return Unexplained(float(np.mean(np.abs(significance[material]) > _SIGNIFICANT)), first, significance)
 
 
 def unexplained_memory(geometry: Geometry) -> int:
@@ -293,14 +293,15 @@ class LostMatter:
 
     Attributes:
         region: (z, y, x), each the first voxel and the one after the last.
-        kept: mass in this region divided by the mass in FBP. Both masses are relative to the air level of their volume.
+        kept_share: mass in this region divided by the mass in FBP. Both masses are relative to the air level of their
+            volume.
     """
 
     region: tuple[tuple[int, int], ...]
-    kept: float
+    kept_share: float
 
 
-def lost_matter(volume: F32, reference: F32, seen: NDArray[np.bool_] | None = None) -> LostMatter | None:
+def lost_matter(volume: F32, reference: F32, in_beam: NDArray[np.bool_] | None = None) -> LostMatter | None:
     """The largest region in which a volume lost weak material that the reference shows above its air level.
 
     The check works on blocks of voxels, so that a volume on disk needs little memory. A region is a union of boxes of 3
@@ -309,7 +310,7 @@ def lost_matter(volume: F32, reference: F32, seen: NDArray[np.bool_] | None = No
     Args:
         volume: [z, y, x], from any method.
         reference: [z, y, x], FBP or FDK.
-        seen: [z], True for slices whose rows had beam. Only these are compared, because in other slices FBP shows
+        in_beam: [z], True for slices whose rows had beam. Only these are compared, because in other slices FBP shows
             filled values. None: all slices.
 
     Returns:
@@ -322,8 +323,8 @@ def lost_matter(volume: F32, reference: F32, seen: NDArray[np.bool_] | None = No
     y, x = np.mgrid[:ny, :nx]
     disc = np.hypot(y - (ny - 1) / 2, x - (nx - 1) / 2) <= _RIM * min(ny, nx) / 2
     inside = np.repeat(disc[None], len(reference_blocks), axis=0)
-    if seen is not None:
-        blocks = seen[: len(reference_blocks) * factor].reshape(-1, factor).all(axis=1)
+    if in_beam is not None:
+        blocks = in_beam[: len(reference_blocks) * factor].reshape(-1, factor).all(axis=1)
         inside &= ndimage.binary_erosion(blocks, iterations=_BESIDE, border_value=1)[:, None, None]
     smooth = [min(_SMOOTHED_BLOCKS, n / 8) for n in reference_blocks.shape]
     reference_blocks, volume_blocks = (
@@ -332,12 +333,12 @@ def lost_matter(volume: F32, reference: F32, seen: NDArray[np.bool_] | None = No
     if not inside.any():
         return None
     reference_air, noise = air_level(reference_blocks[inside])
-    matter = (reference_blocks - reference_air > _ABOVE_AIR * noise) & inside
-    air = inside & ~binary_dilation(matter, iterations=_MARGIN)
+    material = (reference_blocks - reference_air > _ABOVE_AIR * noise) & inside
+    air = inside & ~binary_dilation(material, iterations=_MARGIN)
     if noise == 0 or air.sum() < _LEAST_AIR:
         return None
     volume_air = float(volume_blocks[air].mean(dtype=np.float64))
-    lost = matter & (volume_blocks - volume_air < _LEFT * (reference_blocks - reference_air))
+    lost = material & (volume_blocks - volume_air < _LEFT * (reference_blocks - reference_air))
     core = [min(n, wide) for n, wide in zip(lost.shape, _CORE, strict=True)]
     parts, n = ndimage.label(ndimage.binary_opening(lost, np.ones(core)))
     sizes = np.bincount(parts.ravel())[1:]

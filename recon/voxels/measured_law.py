@@ -211,11 +211,14 @@ class _Slab:
         tried = np.sort(by_angle[:: -(-len(self.views) // _TRIAL_VIEWS)])
         self.volume(_WeightByNoise(), self.views, tried)
         first = float(self.decisions["weight"][0] / math.sqrt(len(tried)))
-        seen, unseen = (tried[part] for part in split_views(self.geometry.select(tried)))
-        projector, held_out = Projector(self.geometry.select(unseen), self.box), projection_lines(self.views[unseen])
+        fitted, left_out = (tried[part] for part in split_views(self.geometry.select(tried)))
+        projector, held_out = (
+            Projector(self.geometry.select(left_out), self.box),
+            projection_lines(self.views[left_out]),
+        )
 
         def residuals(weight: float) -> NDArray[np.float64]:
-            model = projector.forward(self.volume(_TotalVariation(weight), self.views, seen))
+            model = projector.forward(self.volume(_TotalVariation(weight), self.views, fitted))
             return unseen_residuals(projection_lines(model), held_out, None, projector.resolution)
 
         best = preferred_strength(residuals, first) if first > 0 else None
@@ -228,10 +231,10 @@ class _Slab:
         deviation = np.sqrt(photons * float(np.mean(np.square(self.noise, dtype=np.float64))))
         return [(clean + rng.normal(size=clean.shape) * deviation).astype(np.float32) for _ in range(2)]
 
-    def square_error(self, volume: F32, other: F32) -> float:
+    def square_error(self, volume: F32, reference: F32) -> float:
         """Mean square difference of two volumes within the circle of the field of view."""
         y, x = np.meshgrid(*self.box.coordinates()[1:], indexing="ij")
-        difference = np.subtract(volume, other)[:, np.hypot(y, x) < _CIRCLE * self.geometry.reach]
+        difference = np.subtract(volume, reference)[:, np.hypot(y, x) < _CIRCLE * self.geometry.reach]
         return float(np.mean(np.square(difference, dtype=np.float64)))
 
     def unseen_power(self, volume: F32, views: F32, unseen: NDArray[np.intp]) -> float:

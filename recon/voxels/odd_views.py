@@ -76,17 +76,19 @@ def odd_views(grid: Grid, views: Views) -> RayCheck[tuple[OddView, ...]]:
     if in_bands(geometry, grid):
         band, end = _band(geometry), rows - rows % side  # rows at the end that do not fill a cell do not count
         own = [slice(first, min(first + band, end)) for first in range(0, end, band)]
-        asked = [(every, part, slice(max(part.start - _BLUR, 0), min(part.stop + _BLUR, rows))) for part in own]
+        regions = [(every, part, slice(max(part.start - _BLUR, 0), min(part.stop + _BLUR, rows))) for part in own]
     else:
         groups = (every[first : first + _AT_A_TIME] for first in range(0, every.size, _AT_A_TIME))
-        asked = [(some, slice(0, rows), slice(0, rows)) for some in groups]
-    parts = [AskedRays(some, around, partial(_fill, cells, views, some, own, around)) for some, own, around in asked]
+        regions = [(group, slice(0, rows), slice(0, rows)) for group in groups]
+    parts = [
+        AskedRays(group, around, partial(_fill, cells, views, group, own, around)) for group, own, around in regions
+    ]
     return RayCheck(parts, lambda: _odd(*_differences(cells, side), geometry, side))
 
 
 def _odd(differences: F32, edges: F32, geometry: Geometry, side: int) -> tuple[OddView, ...]:
     """The odd projections, found in the `_differences` of all projections."""
-    n, order, found = geometry.n_views, np.argsort(geometry.angles, kind="stable"), []
+    n, order, odd_views = geometry.n_views, np.argsort(geometry.angles, kind="stable"), []
     differences, edges = differences[order], edges[order]
     for place in range(n):
         first = min(max(place - _AROUND, 0), n - _LEAST_VIEWS)
@@ -100,8 +102,8 @@ def _odd(differences: F32, edges: F32, geometry: Geometry, side: int) -> tuple[O
             parts, _ = label(score * math.copysign(1, peak) > _EXTENT * LIMIT)
             region = np.nonzero(parts == parts[worst])
             spans = [(int(cells.min()) * side, (int(cells.max()) + 1) * side) for cells in region]
-            found.append(OddView(int(order[place]), peak, spans[0], spans[1]))
-    return tuple(sorted(found, key=lambda odd: odd.view))
+            odd_views.append(OddView(int(order[place]), peak, spans[0], spans[1]))
+    return tuple(sorted(odd_views, key=lambda odd: odd.view))
 
 
 def odd_views_memory(geometry: Geometry) -> int:
@@ -142,13 +144,13 @@ class _Cells(NamedTuple):
     plain_difference: F32
 
 
-def _fill(cells: _Cells, whole: Views, some: I64, own: slice, around: slice, lines: F32) -> None:
+def _fill(cells: _Cells, whole: Views, group: I64, own: slice, around: slice, lines: F32) -> None:
     """Compute the cells of some projections in the rows `own`, from the projection of the volume in these and the
     neighbouring rows (`around`).
     """
     side, rows = _side(whole.geometry), slice(own.start - around.start, own.stop - around.start)
-    for first in range(0, some.size, _TOGETHER):
-        views = slice(int(some[0]) + first, int(some[0]) + min(first + _TOGETHER, some.size))
+    for first in range(0, group.size, _TOGETHER):
+        views = slice(int(group[0]) + first, int(group[0]) + min(first + _TOGETHER, group.size))
         images = projection_images(lines[first : first + _TOGETHER])
         model, measured = images[:, rows], whole.data[views, own]
         difference = measured - model

@@ -65,7 +65,7 @@ def project_parts(
     volume: Volume,
     geometry: Geometry,
     parts: Sequence[AskedRays],
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Project a volume once and give each part its projection.
 
@@ -75,14 +75,14 @@ def project_parts(
     """
     if not parts:
         return
-    asked = np.zeros((geometry.detector_shape[0], geometry.n_views), bool)
+    requested = np.zeros((geometry.detector_shape[0], geometry.n_views), bool)
     for part in parts:
-        asked[part.rows, part.views] = True
-    rays, views, done = int(asked.sum()), int(asked.any(axis=0).sum()), 0
+        requested[part.rows, part.views] = True
+    rays, views, done = int(requested.sum()), int(requested.any(axis=0).sum()), 0
     waiting = [_Waiting(part) for part in parts]
-    for block in _blocks(volume, geometry, asked):
+    for block in _blocks(volume, geometry, requested):
         waiting = [each for each in waiting if not each.complete_with(block)]
-        done += int(asked[block.rows, block.views].sum())
+        done += int(requested[block.rows, block.views].sum())
         progress(done * views // rays, views)
 
 
@@ -126,25 +126,25 @@ class _Waiting:
         return self.missing == 0
 
 
-def _blocks(volume: Volume, geometry: Geometry, asked: Mask) -> Iterator[_Block]:
+def _blocks(volume: Volume, geometry: Geometry, requested: Mask) -> Iterator[_Block]:
     """The projection of the rays that are asked for [row, view], in blocks in ascending order."""
     if in_bands(geometry, volume.grid):
-        for rows in _equal_rows(asked):
-            views = np.flatnonzero(asked[rows.start])
+        for rows in _equal_rows(requested):
+            views = np.flatnonzero(requested[rows.start])
             _, part, grid = part_of(geometry.select(views), volume.grid, rows)
             yield _Block(views, rows, Projector(part, grid).forward_lines(volume_lines(volume.data[rows])))
         return
-    wanted = np.flatnonzero(asked.any(axis=0))
+    wanted = np.flatnonzero(requested.any(axis=0))
     lines = volume_lines(volume.data)  # computed only once, because for a large volume it takes as long as a projection
     for first in range(0, wanted.size, _AT_A_TIME):
         views = wanted[first : first + _AT_A_TIME]
         projector = Projector(geometry.select(views), volume.grid)
-        yield _Block(views, slice(0, len(asked)), projector.forward_lines(lines))
+        yield _Block(views, slice(0, len(requested)), projector.forward_lines(lines))
 
 
-def _equal_rows(asked: Mask) -> Iterator[slice]:
+def _equal_rows(requested: Mask) -> Iterator[slice]:
     """Bands of up to 16 rows. In all rows of a band the same projections are asked for, at least one."""
-    edges = np.flatnonzero((asked[1:] != asked[:-1]).any(axis=1)) + 1
-    for first, end in zip([0, *edges.tolist()], [*edges.tolist(), len(asked)], strict=True):
-        if asked[first].any():
+    edges = np.flatnonzero((requested[1:] != requested[:-1]).any(axis=1)) + 1
+    for first, end in zip([0, *edges.tolist()], [*edges.tolist(), len(requested)], strict=True):
+        if requested[first].any():
             yield from (slice(row, min(row + BAND, end)) for row in range(first, end, BAND))

@@ -91,8 +91,8 @@ class TvWeight:
         volume, share = start if first is None else np.maximum(first, 0, out=first), 0.0
         if volume is not None:
             variation = total_variation(volume, difference_weights(problem.projector.grid))
-            matter = int(np.count_nonzero(volume > MATTER * density_unit(volume)))
-            share = SHARE_OF_NOISE * noise**2 * matter / variation if variation > 0 else 0.0
+            n_material = int(np.count_nonzero(volume > MATTER * density_unit(volume)))
+            share = SHARE_OF_NOISE * noise**2 * n_material / variation if variation > 0 else 0.0
         whitened_noise = noise if problem.measured is None else noise_of(problem.data)
         return cls(share, whitened_noise * _by_views(problem.projector.geometry), sweeps)
 

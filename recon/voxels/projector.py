@@ -89,11 +89,11 @@ class Projector:
                 f"use a smaller grid: with half a voxel beyond it, the box reaches {reach:.4g} mm from the rotation "
                 f"axis, and the source is at {self.geometry.source_distance:.4g} mm"
             )
-        found = [
-            (band, [self._rays(at) for at in views_of_exposure(views)])
+        bands = [
+            (band, [self._rays(moment_views) for moment_views in views_of_exposure(views)])
             for band, views in bands_of(self.geometry, self.grid)
         ]
-        object.__setattr__(self, "_bands", found)
+        object.__setattr__(self, "_bands", bands)
         object.__setattr__(self, "resolution", ViewResolution.of(self.geometry, self.grid))
         variances = self.resolution.sharpened
         if not self.matched:
@@ -185,16 +185,16 @@ class Projector:
         for band, moments in self._bands:
             whole = band == slice(0, self.grid.shape[0])
             part = source if whole else np.ascontiguousarray(source[..., band])
-            found = out if whole else np.empty((*out.shape[:2], part.shape[2]), np.float32)
-            self._apply(direction, part, moments[0], found)
+            total = out if whole else np.empty((*out.shape[:2], part.shape[2]), np.float32)
+            self._apply(direction, part, moments[0], total)
             if len(moments) > 1:
-                more = np.empty_like(found)
+                more = np.empty_like(total)
                 for rays in moments[1:]:
                     self._apply(direction, part, rays, more)
-                    combine(1.0, found, 1.0, more, found)
-                combine(1 / len(moments), found, 0.0, found, found)
+                    combine(1.0, total, 1.0, more, total)
+                combine(1 / len(moments), total, 0.0, total, total)
             if not whole:
-                out[..., band] = found
+                out[..., band] = total
 
     @property
     def _kernels(self) -> Any:
@@ -260,8 +260,11 @@ def volume_lines(volume: F32) -> F32:
 
 def measured_share(known: Mask, geometry: Geometry, grid: Grid) -> F32:
     """Share [z, y, x] of the rays through each voxel that end on known rows [row] of the detector; 0 if none does."""
-    some = geometry.select(np.arange(0, geometry.n_views, max(1, geometry.n_views // _LOOKED_AT)))
-    projector, rays = Projector(some, grid, matched=False), np.ones((some.n_views, *some.detector_shape), np.float32)
+    sampled = geometry.select(np.arange(0, geometry.n_views, max(1, geometry.n_views // _LOOKED_AT)))
+    projector, rays = (
+        Projector(sampled, grid, matched=False),
+        np.ones((sampled.n_views, *sampled.detector_shape), np.float32),
+    )
     every = projector.adjoint(rays)
     return np.asarray(projector.adjoint(rays * known[:, None]) / np.maximum(every, np.float32(1e-30)), np.float32)
 

@@ -29,7 +29,7 @@ class SquaresLeft(NamedTuple):
 
     The sums are squares of the residual, squares of the projection itself, and the number of these rays."""
 
-    left: F64
+    squares: F64
     own: F64
     rays: F64
 
@@ -42,7 +42,7 @@ class SquaresLeft(NamedTuple):
         """
         if not self.own.any():
             raise ValueError("all projections are zero, so no residual can be computed")
-        return math.sqrt(self.left.sum() / self.own.sum())
+        return math.sqrt(self.squares.sum() / self.own.sum())
 
 
 def squares_left(model: F32, views: F32, weight: F32 | None, resolution: ViewResolution) -> SquaresLeft:
@@ -65,8 +65,8 @@ def unseen_residuals(model: F32, views: F32, weight: F32 | None, resolution: Vie
     """[view] root mean square of the residuals (see `squares_left`), for projections with a measured ray; [inf] if no
     projection has one.
     """
-    left, _, rays = squares_left(model, views, weight, resolution)
-    return np.sqrt(left[rays > 0] / rays[rays > 0]) if rays.any() else np.full(1, np.inf)
+    squares, _, rays = squares_left(model, views, weight, resolution)
+    return np.sqrt(squares[rays > 0] / rays[rays > 0]) if rays.any() else np.full(1, np.inf)
 
 
 def residuals_of(volume: Volume, views: Views) -> F64:
@@ -77,9 +77,9 @@ def residuals_of(volume: Volume, views: Views) -> F64:
     return unseen_residuals(model, projection_lines(views.data), weights, projector.resolution)
 
 
-def _summed(left: F32, views: F32, counts: Mask) -> SquaresLeft:
+def _summed(residuals: F32, views: F32, counts: Mask) -> SquaresLeft:
     sums = [[np.square(view[counted], dtype=np.float64).sum() for view, counted in zip(images, counts, strict=True)]
-            for images in (left, views)]  # fmt: skip
+            for images in (residuals, views)]  # fmt: skip
     return SquaresLeft(np.array(sums[0]), np.array(sums[1]), counts.sum(axis=(1, 2), dtype=np.float64))
 
 
@@ -106,9 +106,9 @@ def residual(grid: Grid, views: Views, most: int) -> RayCheck[tuple[SquaresLeft,
     sums, along = np.zeros((3, 1 + max(int(each.places[-1]) for each in compared))), np.zeros(2)
 
     def compare(part: _Compared, model: F32) -> None:
-        lines, counts, seen = _measured(views, part)
-        sums[:, part.places] += _summed(model - seen, lines, counts)
-        along[:] += [np.square(_without_means(image, counts)).sum() for image in (model - seen, lines)]
+        lines, counts, shown = _measured(views, part)
+        sums[:, part.places] += _summed(model - shown, lines, counts)
+        along[:] += [np.square(_without_means(image, counts)).sum() for image in (model - shown, lines)]
 
     parts = [AskedRays(each.views, each.rows, partial(compare, each)) for each in compared]
     return RayCheck(parts, lambda: (SquaresLeft(*sums), math.sqrt(along[0] / along[1]) if along[1] else 0.0))
@@ -129,11 +129,11 @@ def uniform_residual(grid: Grid, views: Views, most: int) -> tuple[float, int]:
     inside = (np.hypot(y[:, None], x) < grid.spacing[1] * min(grid.shape[1:]) / 2).astype(np.float32)
     own, total, products, norms, rays = 0.0, 0.0, np.zeros(2), np.zeros(2), 0
     for part in _compared(grid, views, most):
-        lines, counts, seen = _measured(views, part)
-        projector, flat = Projector(part.geometry, part.grid), _without_means(seen, counts)
+        lines, counts, shown = _measured(views, part)
+        projector, flat = Projector(part.geometry, part.grid), _without_means(shown, counts)
         own, total = own + float(np.vdot(flat, flat)), total + float(np.square(_without_means(lines, counts)).sum())
-        for n, at in enumerate((inside, np.ones_like(inside))):
-            uniform = np.broadcast_to(at, part.grid.shape)
+        for n, mask in enumerate((inside, np.ones_like(inside))):
+            uniform = np.broadcast_to(mask, part.grid.shape)
             image = _without_means(projector.forward_lines(volume_lines(uniform)), counts)
             products[n] += np.vdot(flat, image)
             norms[n] += np.vdot(image, image)
@@ -143,13 +143,13 @@ def uniform_residual(grid: Grid, views: Views, most: int) -> tuple[float, int]:
 
 
 def _compared(grid: Grid, views: Views, most: int) -> Iterator[_Compared]:
-    some, bands = spread(np.arange(views.geometry.n_views), most), in_bands(views.geometry, grid)
+    sampled_views, bands = spread(np.arange(views.geometry.n_views), most), in_bands(views.geometry, grid)
     # Without bands of rows, groups of projections save memory.
-    for places in np.array_split(np.arange(some.size), 1 if bands else min(some.size, _GROUPS)):
-        geometry = views.geometry.select(some[places])
-        for rows in _bands(views, some) if bands else [slice(0, geometry.detector_shape[0])]:
+    for places in np.array_split(np.arange(sampled_views.size), 1 if bands else min(sampled_views.size, _GROUPS)):
+        geometry = views.geometry.select(sampled_views[places])
+        for rows in _bands(views, sampled_views) if bands else [slice(0, geometry.detector_shape[0])]:
             _, shown, slices = part_of(geometry, grid, rows) if bands else (rows, geometry, grid)
-            yield _Compared(shown, slices, rows, some[places], places)
+            yield _Compared(shown, slices, rows, sampled_views[places], places)
 
 
 def _measured(views: Views, part: _Compared) -> tuple[F32, Mask, F32]:
@@ -170,7 +170,7 @@ def _without_means(lines: F32, known: Mask) -> F64:
     return np.where(known, values - values.sum(axis=1, keepdims=True) / n, 0)
 
 
-def _bands(views: Views, some: I64) -> list[slice]:
+def _bands(views: Views, sampled_views: I64) -> list[slice]:
     """Bands of rows that represent the detector, at equal shares of the material that these projections show.
 
     All rows if the detector is not large.
@@ -179,8 +179,8 @@ def _bands(views: Views, some: I64) -> list[slice]:
     bands = max(1, RAYS // (BAND * cols))
     if rows <= bands * BAND:
         return [slice(first, min(first + BAND, rows)) for first in range(0, rows, BAND)]
-    matter = np.maximum(sum(np.nansum(views.data[view], axis=1, dtype=np.float64) for view in some), 0)
-    reached = np.cumsum(matter if matter.any() else np.ones(rows))
+    absorption = np.maximum(sum(np.nansum(views.data[view], axis=1, dtype=np.float64) for view in sampled_views), 0)
+    reached = np.cumsum(absorption if absorption.any() else np.ones(rows))
     middles = np.searchsorted(reached, (np.arange(bands) + 0.5) / bands * reached[-1])
     starts = np.unique(np.clip(middles - BAND // 2, 0, rows - BAND))
     return [slice(first, first + BAND) for first in starts.tolist()]

@@ -109,15 +109,17 @@ class ViewResolution:
     def transfer(self, axis: int, f: F64) -> F64:
         """Transfer function [view, frequency] of the model relative to measured projections, at f cycles per pixel."""
         edges, variance = self.voxels[:, axis, :, None] * f, self.interpolation[..., None]
-        at = np.sinc(edges)
+        response = np.sinc(edges)
         d = (1 - np.sqrt(np.maximum(1 - 4 * variance, 0))) / 2
         of_two = (1 - d) * np.cos(2 * np.pi * edges * d) + d * np.cos(2 * np.pi * edges * (1 - d))  # in phase
-        share = at.prod(1) * np.where(variance == _ALL, at**2, of_two).prod(1)  # a triangle's is sinc²
+        share = response.prod(1) * np.where(variance == _ALL, response**2, of_two).prod(1)  # a triangle's is sinc²
         pixel, blur = self.views
-        seen = np.sinc(np.sqrt(12 * pixel) * f) * np.exp(-2 * np.pi**2 * blur * f**2)
+        view_transfer = np.sinc(np.sqrt(12 * pixel) * f) * np.exp(-2 * np.pi**2 * blur * f**2)
         passes = max(passes_of(self.sharpened), 1)
         model = (1 + self.sharpened[:, axis, None] / passes * (1 - np.cos(2 * np.pi * f))) ** passes
-        return np.clip(np.divide(share * model, seen, out=np.ones_like(share), where=seen > share * model), 0, 1)
+        return np.clip(
+            np.divide(share * model, view_transfer, out=np.ones_like(share), where=view_transfer > share * model), 0, 1
+        )
 
 
 def on_rows(geometry: Geometry, grid: Grid) -> bool:
@@ -142,14 +144,14 @@ def _interpolation(geometry: Geometry, grid: Grid, axes: F64) -> F64:
     run = np.abs(beam)
     across = np.where(run[:, 1] >= run[:, 0], 1, 0)  # the planes in which a ray is sampled
     across = np.where(run[:, 2] > run[:, :2].max(1), 2, across)
-    found = np.where(across[:, None] != np.arange(3), _ALL, 0.0)
+    variances = np.where(across[:, None] != np.arange(3), _ALL, 0.0)
     if geometry.is_cone:
-        return found
+        return variances
     edges, first, count = (np.array(each[::-1]) for each in (grid.spacing, grid.first, grid.shape))
     lean = beam / beam[views, across][:, None]
     col, row = (each - each[views, across][:, None] * lean for each in (columns, rows))
     origin = np.array([geometry.axis_col, geometry.axis_row]) + geometry.shifts
-    at = first[across][:, None] * lean - geometry.pixel_pitch * (origin[:, :1] * col + origin[:, 1:] * row) - first
+    offset = first[across][:, None] * lean - geometry.pixel_pitch * (origin[:, :1] * col + origin[:, 1:] * row) - first
     scale = geometry.pixel_pitch / edges
     steps = (
         (scale * row, 1 / _ON_ROWS * _STILL),  # so that slabs agree
@@ -157,9 +159,9 @@ def _interpolation(geometry: Geometry, grid: Grid, axes: F64) -> F64:
         (edges[across][:, None] * lean / edges, count[across][:, None]),
     )
     still = np.all([np.abs(step - np.rint(step)) * many < _STILL for step, many in steps], axis=0)
-    d = at / edges
+    d = offset / edges
     d -= np.floor(d)
-    return np.where(still & (found > 0), np.round(d * (1 - d), _DIGITS), found)
+    return np.where(still & (variances > 0), np.round(d * (1 - d), _DIGITS), variances)
 
 
 def at_voxel_resolution(views: F32, resolution: ViewResolution, counts: NDArray[np.bool_] | None = None) -> F32:
@@ -179,18 +181,18 @@ def at_voxel_resolution(views: F32, resolution: ViewResolution, counts: NDArray[
 def _filtered(views: F32, filters: list[F64]) -> F32:
     """Projections [view, col, row] filtered along columns and rows, a few at a time, to save memory in float64."""
     out = np.empty_like(views)
-    for at, view in enumerate(views):
-        found = view.astype(np.float64)
+    for index, view in enumerate(views):
+        filtered = view.astype(np.float64)
         for axis, shares in enumerate(filters):
-            n, share = view.shape[axis], shares[at]
+            n, share = view.shape[axis], shares[index]
             if n == 1 or (share == 1).all():
                 continue
             wide = [(0, 0), (0, 0)]
             wide[axis] = _PAD, _PAD
-            lines = np.moveaxis(np.pad(found, wide, mode="edge"), axis, 1)
+            lines = np.moveaxis(np.pad(filtered, wide, mode="edge"), axis, 1)
             lines = np.fft.irfft(np.fft.rfft(lines) * share, n + 2 * _PAD)
-            found = np.moveaxis(lines[:, _PAD : _PAD + n], 1, axis)
-        out[at] = found
+            filtered = np.moveaxis(lines[:, _PAD : _PAD + n], 1, axis)
+        out[index] = filtered
     return out
 
 

@@ -29,13 +29,13 @@ class OrthogonalSlices:
 
     Attributes:
         images: float32 [y, x], [z, x] and [z, y], 1/mm.
-        at: z, y and x in mm of the point in which the slices cross.
+        centre: z, y and x in mm of the point in which the slices cross.
         pixel: side of a voxel in mm.
         covered: radians of the 180° that the projections cover; π if no wedge is missing.
     """
 
     images: tuple[F32, F32, F32]
-    at: tuple[float, float, float]
+    centre: tuple[float, float, float]
     pixel: float
     covered: float
 
@@ -61,10 +61,10 @@ def orthogonal_slices(views: Sequence[F32], geometry: Geometry) -> OrthogonalSli
     if geometry.is_cone or not geometry.is_straight or geometry.shifts[:, 1].any():
         raise ValueError("slices during a scan need a parallel beam without roll, tilt and shifts along the axis")
     covered = float(angular_weights(geometry.angles).sum())
-    some = spread_views(geometry.angles, _VIEWS, np.arange(len(views)))
+    view_numbers = spread_views(geometry.angles, _VIEWS, np.arange(len(views)))
     factor = math.ceil(max(geometry.detector_shape) / _SIDE)
-    data = np.stack([_binned(np.asarray(views[i], np.float32), factor) for i in some])
-    geometry = geometry.select(some).binned(factor)
+    data = np.stack([_binned(np.asarray(views[i], np.float32), factor) for i in view_numbers])
+    geometry = geometry.select(view_numbers).binned(factor)
     grid = Grid.matching(geometry)
     nz, ny, nx = grid.shape
     middle = grid.part(slice(nz // 2, nz // 2 + 1), slice(0, ny), slice(0, nx))
@@ -106,7 +106,7 @@ def _along(data: F32, geometry: Geometry, points: F64) -> F32:
             cols += geometry.axis_col + shift + zeros[0]
             low = np.clip(np.floor(cols).astype(np.intp), 0, len(view) - 2)
             near = (cols - low).astype(np.float32)[:, None]
-            seen = ((cols >= -0.5) & (cols <= len(view) - 0.5)).astype(np.float32)[:, None]
+            inside = ((cols >= -0.5) & (cols <= len(view) - 0.5)).astype(np.float32)[:, None]
             np.clip(near, 0, 1, out=near)
-            out += seen * ((1 - near) * view[low] + near * view[low + 1])
+            out += inside * ((1 - near) * view[low] + near * view[low + 1])
     return out

@@ -19,7 +19,7 @@ _ALIKE = 0.4  # standard deviation of gaps over their mean: 0.24 for golden angl
 _SAME_ANGLE = 1e-3  # share of the mean step; projections that are closer share one weight
 
 
-def angular_weights(angles: ArrayLike, of: ArrayLike | None = None) -> NDArray[np.float64]:
+def angular_weights(angles: ArrayLike, whole_scan: ArrayLike | None = None) -> NDArray[np.float64]:
     """Quadrature weight of each projection in radians: its Voronoi cell on the half circle.
 
     Projections at θ and θ + π see the same rays, so angles count modulo π; projections with equal angles share their
@@ -29,8 +29,8 @@ def angular_weights(angles: ArrayLike, of: ArrayLike | None = None) -> NDArray[n
 
     Args:
         angles: [view], radians, any order and range.
-        of: angles of the scan of which these projections are a part. A missing wedge is then judged by the usual step
-            of that scan.
+        whole_scan: angles of the scan of which these projections are a part. A missing wedge is then judged by the
+            usual step of that scan.
 
     Raises:
         ValueError: there are no angles, or some are not finite.
@@ -38,7 +38,7 @@ def angular_weights(angles: ArrayLike, of: ArrayLike | None = None) -> NDArray[n
     theta = np.mod(np.asarray(angles, dtype=np.float64).ravel(), np.pi)
     if theta.size == 0 or not np.isfinite(theta).all():
         raise ValueError(f"weights need at least one angle, and all angles must be finite; got {theta.size} angles")
-    whole = None if of is None else np.asarray(of, np.float64).ravel()
+    whole = None if whole_scan is None else np.asarray(whole_scan, np.float64).ravel()
     if theta.size == 1:
         return np.full(1, np.pi if whole is None else _usual_step(whole))
     order = np.argsort(theta, kind="stable")
@@ -152,26 +152,28 @@ def seen_by(geometry: Geometry, rows: F64) -> NDArray[np.bool_]:
     Args:
         rows: [slice], detector rows at which an unshifted projection sees the slices.
     """
-    at = rows + geometry.shifts[:, 1:]
-    return (at >= -0.5) & (at <= geometry.detector_shape[0] - 0.5)
+    detector_rows = rows + geometry.shifts[:, 1:]
+    return (detector_rows >= -0.5) & (detector_rows <= geometry.detector_shape[0] - 0.5)
 
 
-def slice_weights(geometry: Geometry, seen: NDArray[np.bool_], share: F64) -> F64:
+def slice_weights(geometry: Geometry, covered: NDArray[np.bool_], share: F64) -> F64:
     """Weights [view, 1 + col + 1] of the rays of one slice, from the projections that see it; 0 for the others.
 
     The weights are those of `ray_weights`. If projections step along the axis, each slice is seen from its own set of
     angles, some of them several times.
 
     Args:
-        seen: [view], True for projections that see the slice.
+        covered: [view], True for projections that see the slice.
         share: `column_shares` of all projections.
     """
     weights = np.zeros(share.shape)
-    if not seen.any():
+    if not covered.any():
         return weights
-    angles = geometry.angles[seen]
+    angles = geometry.angles[covered]
     both = angular_weights(angles, geometry.angles)[:, None]
-    weights[seen] = _weighed(share[seen], both, circle_weights(angles)[:, None]) if covers_the_circle(angles) else both
+    weights[covered] = (
+        _weighed(share[covered], both, circle_weights(angles)[:, None]) if covers_the_circle(angles) else both
+    )
     return weights
 
 
@@ -182,10 +184,10 @@ def partly_seen(geometry: Geometry, rows: F64) -> NDArray[np.bool_]:
         rows: as for `seen_by`.
     """
     keys, known = list[bytes](), dict[bytes, float]()
-    for some in seen_by(geometry, rows).T:
-        keys.append(some.tobytes())
+    for row_covered in seen_by(geometry, rows).T:
+        keys.append(row_covered.tobytes())
         if keys[-1] not in known:
-            angles = geometry.angles[some]
+            angles = geometry.angles[row_covered]
             known[keys[-1]] = float(angular_weights(angles, geometry.angles).sum()) if angles.size else 0.0
     covered = np.array([known[key] for key in keys])
     return covered < covered.max() - 1.5 * _usual_step(geometry.angles)
@@ -292,7 +294,7 @@ def unseen_wedges(geometry: Geometry) -> list[Wedge]:
     if math.pi - float(angular_weights(geometry.angles).sum()) < typical / 2:
         return []
     wide = np.flatnonzero(_missing(gaps, math.pi))
-    return [Wedge(float(np.mod(theta[at] + typical / 2, np.pi)), float(gaps[at] - typical)) for at in wide]
+    return [Wedge(float(np.mod(theta[gap] + typical / 2, np.pi)), float(gaps[gap] - typical)) for gap in wide]
 
 
 def density_gain(geometry: Geometry) -> float:

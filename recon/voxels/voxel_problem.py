@@ -88,18 +88,18 @@ class Sweeps:
             Σ weight (A x - p)², each ray before its own correction.
         """
         order = np.arange(len(self._parts)) if rng is None else rng.permutation(len(self._parts))
-        total, seen, device = 0.0, [], self._device
+        total, residuals, device = 0.0, [], self._device
         volume = device.array(x)
         for index in order:
             part, data, weight, scale = self._parts[index]
             residual = part.forward_lines(volume)  # first the model; the data are subtracted next
-            some = slice(None, None, max(1, len(self._parts) * len(data) // _LOOKED_AT))
-            weights_of_rays = None if weight is None else device.numpy(weight[some])
-            seen.append(whitened(device.numpy(data[some] - residual[some]), weights_of_rays))
+            sampled = slice(None, None, max(1, len(self._parts) * len(data) // _LOOKED_AT))
+            weights_of_rays = None if weight is None else device.numpy(weight[sampled])
+            residuals.append(whitened(device.numpy(data[sampled] - residual[sampled]), weights_of_rays))
             total += device.replace_by_residual(data, residual, weight, scale)
             part.adjoint_lines(residual, self._gradient)
             device.add_product(volume, relaxation, self._step, self._gradient, nonnegative)
-        self.residual = np.concatenate(seen)
+        self.residual = np.concatenate(residuals)
         if volume is not x:
             x[...] = device.numpy(volume)
         return total
@@ -139,13 +139,13 @@ class Units(NamedTuple):
     def density(self) -> int:
         return self.integral - self.length
 
-    def projector(self, other: Projector, sign: int = -1) -> Projector:
+    def projector(self, projector: Projector, sign: int = -1) -> Projector:
         """The projector in these units; with sign 1, converted back to the units of the scan."""
-        box, power = other.grid, sign * self.length
+        box, power = projector.grid, sign * self.length
         edge, slices = (math.ldexp(n, power) for n in (box.voxel_size, box.spacing[0]))
         z, y, x = (math.ldexp(n, power) for n in box.centre)
         grid = Grid(box.shape, edge, (z, y, x), slices)
-        return replace(other, geometry=other.geometry.scaled(math.ldexp(1.0, power)), grid=grid)
+        return replace(projector, geometry=projector.geometry.scaled(math.ldexp(1.0, power)), grid=grid)
 
     def prior(self, prior: Prior, weighed: bool, sign: int = -1) -> Prior:
         """The prior in these units, for rays with (`weighed`) or without weights.
@@ -254,9 +254,9 @@ class VoxelProblem:
         """FBP or FDK [y, x, z] of the projections, with rays of weight 0 filled; None if neither can be used."""
         images, geometry = projection_images(self.views), self.projector.geometry
         if self.weight is not None:
-            seen = np.flatnonzero(self.weight.any(axis=(1, 2)))
-            geometry = geometry.select(seen)
-            images = masked(images[seen], projection_images(self.weight[seen]))[0]
+            measured_views = np.flatnonzero(self.weight.any(axis=(1, 2)))
+            geometry = geometry.select(measured_views)
+            images = masked(images[measured_views], projection_images(self.weight[measured_views]))[0]
         if not has_direct_method(geometry):
             return None
         return volume_lines(direct(images, geometry, self.projector.grid, filter, device=self.projector.device))
@@ -341,9 +341,9 @@ def one_of_like_rows(projector: Projector, weight: F32 | None) -> Projector:
     alike = weight is None and slices_are_rows(projector) and not (geometry.skew or geometry.width)
     if not (alike and slices > 1):
         return projector
-    some, grid = geometry.rows(0, 1), projector.grid
-    centre = (Grid.matching(some).centre[0], *grid.centre[1:])
-    return replace(projector, geometry=some, grid=replace(grid, shape=(1, *grid.shape[1:]), centre=centre))
+    one_row, grid = geometry.rows(0, 1), projector.grid
+    centre = (Grid.matching(one_row).centre[0], *grid.centre[1:])
+    return replace(projector, geometry=one_row, grid=replace(grid, shape=(1, *grid.shape[1:]), centre=centre))
 
 
 def slices_are_rows(projector: Projector) -> bool:
@@ -376,8 +376,8 @@ def bytes_of(buffers: Buffers, geometry: Geometry, grid: Grid, weighted: bool = 
     volumes = buffers.volumes + (geometry.width.arc > 0)  # for the angles within one exposure
     rays = buffers.rays + bool(geometry.width) + bool(ViewResolution.of(geometry, grid).smoothed.any())
     rays += buffers.weights * weighted
-    beside = fbp_memory(geometry.n_views, wide) if buffers.filtered else 0
-    return round(4 * (volumes * math.prod(grid.shape) + rays * n_rays)) + beside
+    fbp_buffers = fbp_memory(geometry.n_views, wide) if buffers.filtered else 0
+    return round(4 * (volumes * math.prod(grid.shape) + rays * n_rays)) + fbp_buffers
 
 
 def difference_weights(grid: Grid) -> tuple[float, float, float]:
@@ -413,10 +413,10 @@ class TotalVariationProx:
         `threshold`, 0 or more, is in the unit of x.
         """
         if threshold > 0:
-            given, back = (threshold, self._weights, self._nonnegative, self._scratch), _BACK[self._turn]
+            arguments, back = (threshold, self._weights, self._nonnegative, self._scratch), _BACK[self._turn]
             for _ in range(self._steps):
-                self._device.dual_step(x, self._dual, *given, back)
-            self._device.primal(x, self._dual, *given, x)
+                self._device.dual_step(x, self._dual, *arguments, back)
+            self._device.primal(x, self._dual, *arguments, x)
         elif self._nonnegative:
             x[x < 0] = 0
 

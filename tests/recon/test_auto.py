@@ -85,7 +85,7 @@ def test_the_volume_has_the_prior_of_its_trial_in_any_units(data: F32, monkeypat
     decide = Decisions()
     problem = ReconProblem(Views(data, VIEWS), GRID)
     choice = auto.choose(problem, recon.RunControl())
-    assert choice.prior is not None and choice.at == 1
+    assert choice.prior is not None and choice.chosen == 1
     found = recon.reconstruct(data, VIEWS, auto, control=recon.RunControl(decide=decide)).volume.data
     np.testing.assert_array_equal(found, recon.reconstruct(data, VIEWS, FistaTv()).volume.data)
     monkeypatch.setattr("recon.voxels.trial.Trial.of", lambda *_: pytest.fail("a second trial"))
@@ -162,7 +162,9 @@ def test_patches_are_not_tried_of_a_sample_wider_than_the_field(data: F32, monke
             return trial.predicted(self)
 
     choice = Auto((Asking(), recon.PnpDct())).choose(problem, recon.RunControl())
-    assert choice.at == 0 and "pnp-dct not tried, because the sample is wider than the field of view" in choice.reason
+    assert (
+        choice.chosen == 0 and "pnp-dct not tried, because the sample is wider than the field of view" in choice.reason
+    )
     assert priors == [Prior(0.5)]  # and none is sought for its volume
 
 

@@ -49,14 +49,14 @@ class LearntGains:
 
     Attributes:
         pixels: float32 [row, col]; 0 if held-out projections do not confirm them.
-        without, left: root mean square residual in held-out projections, without the gains and with them, in the rows
-            with most material. Both are 0 if no stripes were found, because nothing was measured then.
+        without, with_gains: root mean square residual in held-out projections, without the gains and with them, in the
+            rows with most material. Both are 0 if no stripes were found, because nothing was measured then.
         confirmed: True if held-out projections confirm the gains.
     """
 
     pixels: F32
     without: float
-    left: float
+    with_gains: float
     confirmed: bool
 
 
@@ -64,7 +64,7 @@ def learn_gains(
     projections: F32,
     geometry: Geometry,
     measured: Mask | None = None,
-    progress: Callable[[int, int], object] = lambda n, of: None,
+    progress: Callable[[int, int], object] = lambda n, total: None,
 ) -> LearntGains:
     """Measure the pixel sensitivities, and keep those that held-out projections confirm. For the memory, see
     `gains_memory`.
@@ -87,29 +87,31 @@ def learn_gains(
             f"too few data to measure pixel sensitivities: {n} projections of {cols} columns; at least {LEAST_VIEWS} "
             f"projections of {LEAST_COLS} columns are needed"
         )
-    seen, unseen = split_views(geometry, _ONE_IN)
+    fitted, unseen = split_views(geometry, _ONE_IN)
     gains, height = np.zeros((rows, cols), np.float32), _height(geometry)
     busiest = busiest_rows(projections, height).start
     if not _stripes_seen(projections[:, busiest : busiest + height], geometry):
         return LearntGains(gains, 0.0, 0.0, False)
     lowest = busiest % height - height * (busiest % height > 0)
-    starts = sorted(range(lowest, rows, height), key=lambda at: at != busiest)
-    without = left = np.zeros(1)
+    starts = sorted(range(lowest, rows, height), key=lambda start: start != busiest)
+    without = with_gains = np.zeros(1)
     for done, start in enumerate(starts):
         progress(done, len(starts))
         inner = slice(max(start, 0), min(start + height, rows))
         outer = slice(max(inner.start - _HALO, 0), min(inner.stop + _HALO, rows))
         band = _Band.of(projections, geometry, outer, measured)
-        volume, pixels = band.learn(seen)
+        volume, pixels = band.learn(fitted)
         own = slice(inner.start - outer.start, inner.stop - outer.start)
         gains[inner] = pixels[own]
         if done == 0:
-            plain, _ = band.learn(seen, gains=False)
+            plain, _ = band.learn(fitted, gains=False)
             none = np.zeros_like(pixels)
-            without, left = band.errors(plain, none, unseen, own), band.errors(volume, pixels, unseen, own)
-            if not (exceeds_standard_error(without - left, _SURE) and left.mean() < _BETTER * without.mean()):
-                return LearntGains(np.zeros_like(gains), _root(without), _root(left), False)
-    return LearntGains(gains, _root(without), _root(left), True)
+            without, with_gains = band.errors(plain, none, unseen, own), band.errors(volume, pixels, unseen, own)
+            if not (
+                exceeds_standard_error(without - with_gains, _SURE) and with_gains.mean() < _BETTER * without.mean()
+            ):
+                return LearntGains(np.zeros_like(gains), _root(without), _root(with_gains), False)
+    return LearntGains(gains, _root(without), _root(with_gains), True)
 
 
 def gains_memory(geometry: Geometry) -> int:
@@ -153,17 +155,17 @@ class _Band:
         views = geometry if whole else geometry.rows(rows.start, rows.stop)
         return cls(np.ascontiguousarray(projections[:, rows]), views, known)
 
-    def learn(self, seen: NDArray[np.intp], gains: bool = True) -> tuple[Volume, F32]:
+    def learn(self, view_numbers: NDArray[np.intp], gains: bool = True) -> tuple[Volume, F32]:
         """The volume from some projections, and the gains [row, col] from its residual."""
-        views = self.geometry.select(seen)
+        views = self.geometry.select(view_numbers)
         projector = Projector(views, Grid.matching(self.geometry))
         weight = None if self.known is None else np.broadcast_to(self.known, projector.projection_shape).astype("f4")
         decide, gains_so_far, volume = Decisions(), np.zeros(self.data.shape[1:], np.float32), None
-        data = self.data[seen]
-        for at in range(_ROUNDS):
-            method = EarlyTv(_SWEEPS if at else _FIRST, _TV_WEIGHT)
+        data = self.data[view_numbers]
+        for turn in range(_ROUNDS):
+            method = EarlyTv(_SWEEPS if turn else _FIRST, _TV_WEIGHT)
             volume = solve(method, projector, data, weight=weight, start=volume, decide=decide)
-            if gains and at + 1 < _ROUNDS:
+            if gains and turn + 1 < _ROUNDS:
                 residual = ring_offsets(data - projector.forward(volume.data), views) * self._distinguished()
                 data -= residual
                 gains_so_far += residual

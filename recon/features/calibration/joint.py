@@ -252,7 +252,7 @@ class _Model:
                 for t in (trial, -trial)
             )
             return (there.forward_lines(volume) - back.forward_lines(volume)) / np.float32(2 * trial)
-        by_x, by_y = (self._projector.forward_lines(volume * at) for at in (self._x, self._y))
+        by_x, by_y = (self._projector.forward_lines(volume * coordinate) for coordinate in (self._x, self._y))
         return -_along_rows(by_y * self._cos - by_x * self._sin)
 
 
@@ -289,8 +289,8 @@ def _solved(
     """The change of the volume and of each quantity that may change: [view] for positions of projections, [1] for the
     others."""
     first = model.adjoint(weighed(residual))
-    seen = model.forward(first)
-    typical = float(np.vdot(seen, weighed(seen)) / max(float(np.vdot(first, first)), 1e-30))
+    shown = model.forward(first)
+    typical = float(np.vdot(shown, weighed(shown)) / max(float(np.vdot(first, first)), 1e-30))
     scale: dict[str, NDArray[np.float64]] = {}
     for name, slope in free.items():
         information = np.einsum("vcr,vcr->v", slope, weighed(slope)).astype(np.float64)

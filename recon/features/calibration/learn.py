@@ -78,9 +78,9 @@ def _without_smooth(image: F32) -> F64:
     return np.asarray(image - gaussian_filter(image, _SMOOTH, mode="nearest"), np.float64)
 
 
-def better(one: F64, other: F64) -> bool:
+def better(residuals: F64, reference_residuals: F64) -> bool:
     """Whether the first deviations [view] are significantly smaller than the second deviations, given their scatter."""
-    share: NDArray[np.float64] = 1 - np.square(one) / np.maximum(np.square(other), 1e-30)
+    share: NDArray[np.float64] = 1 - np.square(residuals) / np.maximum(np.square(reference_residuals), 1e-30)
     return bool(share.mean() > _LEAST) and exceeds_standard_error(share, _SURE)
 
 
@@ -117,14 +117,14 @@ class LearntGeometry:
         changes = ", ".join(_text(self.change, term, binning) for term in self.confirmed)
         if not (self.confirmed or self.dropped):
             return "Geometry: unchanged, because the projections show no error that matters."
-        kept = f"{', '.join(self.dropped)}: unchanged, because held-out projections do not confirm a change."
+        unchanged = f"{', '.join(self.dropped)}: unchanged, because held-out projections do not confirm a change."
         if not changes:
-            return f"Geometry: {kept}"
+            return f"Geometry: {unchanged}"
         first = (
             f"Geometry calibrated: {changes}. The deviation of held-out projections fell from {self.before:.4g} to "
             f"{self.after:.4g}."
         )
-        return f"{first} {kept[0].upper()}{kept[1:]}" if self.dropped else first
+        return f"{first} {unchanged[0].upper()}{unchanged[1:]}" if self.dropped else first
 
     def parameters(self, binning: int = 1) -> Mapping[str, NDArray[np.float64] | float | str]:
         """The values for the file of a volume, by name, in unbinned pixels."""
@@ -227,22 +227,26 @@ def _confirmed(
         return judge.deviations(change.of(frozenset(terms)).scaled(1 / factor).applied(small))
 
     before, groups = judged([]), _groups(wanted)
-    kept, after = list(wanted), judged(wanted) if wanted else before
+    confirmed, after = list(wanted), judged(wanted) if wanted else before
     if not better(after, before):
-        kept, after = [], before
+        confirmed, after = [], before
         for group in groups if len(groups) > 1 else []:
             alone = judged(group)
             if better(alone, after):
-                kept, after = group, alone
+                confirmed, after = group, alone
     elif len(groups) > 1:
         for group in groups:
-            rest = [term for term in kept if term not in group]
+            rest = [term for term in confirmed if term not in group]
             without = judged(rest)
             if not better(after, without):
-                kept, after = rest, without
-    asked = [term for term in wanted if term not in kept]
+                confirmed, after = rest, without
+    dropped = [term for term in wanted if term not in confirmed]
     return LearntGeometry(
-        change.of(frozenset(kept)), tuple(kept), tuple(asked), float(np.median(before)), float(np.median(after))
+        change.of(frozenset(confirmed)),
+        tuple(confirmed),
+        tuple(dropped),
+        float(np.median(before)),
+        float(np.median(after)),
     )
 
 

@@ -140,18 +140,20 @@ class MaterialTrial:
         """
         count, tried = len(chosen.levels), {chosen.tv_share: (best, chosen)}
 
-        def at(tv_share: float) -> tuple[F64, MaterialPrior]:
+        def trial_of(tv_share: float) -> tuple[F64, MaterialPrior]:
             if tv_share not in tried:
                 tried[tv_share] = self._tried(count, tv_share)
             return tried[tv_share]
 
         share = 1.0
-        while share > least_share and significantly_better(at(share / 2)[0], at(share)[0], LEAST_GAIN):
+        while share > least_share and significantly_better(trial_of(share / 2)[0], trial_of(share)[0], LEAST_GAIN):
             share /= 2
-        lighter, own, heavier = (float(at(each)[0].mean()) for each in (max(share / 2, least_share), share, 2 * share))
+        lighter, own, heavier = (
+            float(trial_of(each)[0].mean()) for each in (max(share / 2, least_share), share, 2 * share)
+        )
         below, above = lighter - own, heavier - own
         octaves = float(np.clip((below - above) / (2 * (below + above)), -0.5, 0.5)) if below + above > 0 else 0.0
-        return *at(share), max(share if self._trial.wide else share * _HEAVIER * 2.0**octaves, least_share)
+        return *trial_of(share), max(share if self._trial.wide else share * _HEAVIER * 2.0**octaves, least_share)
 
     def _better(self, best: F64, chosen: MaterialPrior, count: int, tv_share: float) -> tuple[F64, MaterialPrior]:
         """This candidate if it predicts significantly better, otherwise the best one so far."""

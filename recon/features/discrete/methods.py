@@ -112,10 +112,10 @@ class Discrete(HalfVoxels):
         The probabilities of a voxel add up to less than 1. The rest is the probability that the voxel is a
         partial-volume voxel. The result is None if the volume with these settings was not pulled to discrete levels.
         """
-        given: list[Any] = [settings.get(name + _OF, ()) for name in MaterialPrior._fields]
-        if not len(given[0]):
+        fields: list[Any] = [settings.get(name + _OF, ()) for name in MaterialPrior._fields]
+        if not len(fields[0]):
             return None
-        of_lines = probabilities(volume_lines(volume.data), MaterialPrior(*given))
+        of_lines = probabilities(volume_lines(volume.data), MaterialPrior(*fields))
         return np.ascontiguousarray(of_lines.transpose(0, 3, 1, 2))
 
     @classmethod
@@ -134,8 +134,8 @@ class Discrete(HalfVoxels):
             return Prediction(
                 self.name, remark=f"{self.name}: not tried, because no weight of total variation could be chosen"
             )
-        found = self._choice(trial, trial.weight)
-        return trial.prediction(self.name, found.best, Prior(trial.weight, materials=found.materials))
+        trial_result = self._choice(trial, trial.weight)
+        return trial.prediction(self.name, trial_result.best, Prior(trial.weight, materials=trial_result.materials))
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         decide = control.decide or Decisions(problem.seed)
@@ -175,10 +175,10 @@ class Discrete(HalfVoxels):
             trial: function that returns the test reconstruction of the problem.
         """
         density = problem.units.density
-        kept: list[Any] = problem.decide(
+        decided: list[Any] = problem.decide(
             MATERIALS, lambda: [*self._materials(problem, weight, trial()).scaled(density)]
         )
-        materials = MaterialPrior(*kept).scaled(-density)
+        materials = MaterialPrior(*decided).scaled(-density)
         return materials if materials.levels else None
 
     def pulled(
@@ -214,6 +214,6 @@ class Discrete(HalfVoxels):
     def _choice(self, trial: Trial, weight: float) -> MaterialTrial:
         unit = -trial.problem.units.density
         levels = None if self.levels is None else [math.ldexp(level, unit) for level in self.levels]
-        found = MaterialTrial(trial, weight, self.iterations, levels)
-        found.choose()
-        return found
+        material_trial = MaterialTrial(trial, weight, self.iterations, levels)
+        material_trial.choose()
+        return material_trial

@@ -202,6 +202,6 @@ def probabilities(x: F32, materials: MaterialPrior) -> F32:
     The rest is the probability of a partial voxel. The values are cautious: of the voxels with a half and more, over 99
     % are within a quarter of the gap from that material. Memory: one volume per material, plus one.
     """
-    found = np.empty((len(materials.levels), *x.shape), np.float32)
-    posterior_mean(x, table_of(materials._replace(noise=LEAST_NOISE)), np.empty_like(x), found)
-    return found
+    shares = np.empty((len(materials.levels), *x.shape), np.float32)
+    posterior_mean(x, table_of(materials._replace(noise=LEAST_NOISE)), np.empty_like(x), shares)
+    return shares

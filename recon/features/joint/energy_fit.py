@@ -160,11 +160,11 @@ class EnergyFit:
     def __post_init__(self) -> None:
         views = self.views
         counts = np.bincount(views.energy, minlength=len(views.cross_sections))
-        seen = np.sqrt(counts / counts.max())[:, None]
-        u, values, mix = np.linalg.svd(seen * views.cross_sections, full_matrices=False)
+        root_counts = np.sqrt(counts / counts.max())[:, None]
+        u, values, mix = np.linalg.svd(root_counts * views.cross_sections, full_matrices=False)
         self._to = values[:, None] * mix
         self._back = mix.T / values
-        self._u = np.divide(u, seen, out=np.zeros_like(u), where=seen > 0)
+        self._u = np.divide(u, root_counts, out=np.zeros_like(u), where=root_counts > 0)
         whole, data = Projector(views.geometry, self.grid), projection_lines(views.projections)
         weight = np.ones_like(data) if views.weight is None else projection_lines(views.weight)
         self._norm = (
@@ -176,9 +176,9 @@ class EnergyFit:
             own = [np.flatnonzero((subset == number) & (views.energy == e)) for e in range(counts.size)]
             self.subsets.append(
                 [
-                    _Part(e, whole.subset(at), data[at], None if views.weight is None else weight[at])
-                    for e, at in enumerate(own)
-                    if at.size
+                    _Part(e, whole.subset(indices), data[indices], None if views.weight is None else weight[indices])
+                    for e, indices in enumerate(own)
+                    if indices.size
                 ]
             )
         nz, ny, nx = self.grid.shape
@@ -250,7 +250,7 @@ class EnergyFit:
         for sweep in range(n):
             squares = 0.0
             order = [number for _ in range(_SUBSETS // count) for number in self.rng.permutation(count)]
-            for at, number in enumerate(order):
+            for turn, number in enumerate(order):
                 try:
                     squares += self.descent(self.subsets[number], descent)
                 except StoppedError:
@@ -262,7 +262,7 @@ class EnergyFit:
                     near(component, float(weight) * self.step / count)
                     near.turn()
                 nonnegative_mix(self.z, self._back, self._to)
-                if at + 1 < len(order):
+                if turn + 1 < len(order):
                     ahead(self.z)
             yield math.sqrt(squares * count / len(order)) / self._norm
             if sweep + 1 < n:

@@ -78,12 +78,12 @@ def unseen_squares(
     block = fine.views.energy * _BLOCKS // len(fine.views.cross_sections)
     held_out = block % _ONE_BLOCK_IN == _ONE_BLOCK_IN // 2
     used, follow = np.flatnonzero(~held_out), 2 * JUDGED_SWEEPS
-    seen = coarse._replace(views=coarse.views.select(used, slice(None)))
-    motion = learnt_motion(seen, lambda sweep, residual: go_on(sweep - follow, residual), stop)
+    fitted = coarse._replace(views=coarse.views.select(used, slice(None)))
+    motion = learnt_motion(fitted, lambda sweep, residual: go_on(sweep - follow, residual), stop)
     if motion is None:
         return None
     views = _binned(fine.views, round(fine.views.geometry.detector_shape[1] / JUDGED))
-    grid, left = Grid.matching(views.geometry), []
+    grid, squares_of_fits = Grid.matching(views.geometry), []
     nz, ny, nx = grid.shape
     for now in (None, motion.on((ny, nx, nz), fine.times)):
         fit = EnergyFit(views.select(used, slice(None)), grid, np.random.default_rng(0), now, stop)
@@ -93,9 +93,9 @@ def unseen_squares(
                 return None
         if stop():
             return None
-        left.append(_residual_squares(views, fit.densities(), now, grid))
+        squares_of_fits.append(_residual_squares(views, fit.densities(), now, grid))
     numbers = np.unique(block[held_out])
-    of_blocks = np.array([[squares[block == number].sum() for number in numbers] for squares in left])
+    of_blocks = np.array([[squares[block == number].sum() for number in numbers] for squares in squares_of_fits])
     own = _residual_squares(views, np.zeros_like(fit.densities()), None, grid)[held_out].sum() / numbers.size
     return of_blocks / (own or 1.0)
 
@@ -128,13 +128,13 @@ def learnt_motion(
     alone = replace(views, cross_sections=np.ones((times.size, 1)))
     motion, follow = None, SWEEPS_OF_TURN * sum(turns for _, turns in levels(cols))
     for wide, turns in levels(cols):
-        some = _binned(alone, wide)
-        grid = Grid.matching(some.geometry)
+        binned = _binned(alone, wide)
+        grid = Grid.matching(binned.geometry)
         nz, ny, nx = grid.shape
         motion = (
             Motion.none((ny, nx, nz), times, _KNOTS, _CONTROLS) if motion is None else motion.on((ny, nx, nz), times)
         )
-        fit, seen = EnergyFit(some, grid, np.random.default_rng(0), motion, stop), _seen(some, grid)
+        fit, energies = EnergyFit(binned, grid, np.random.default_rng(0), motion, stop), _seen(binned, grid)
         for _ in range(turns):
             for residual in fit.sweeps(np.full(1, _HEAVIER * weights.max()), SWEEPS_OF_TURN):
                 follow -= 1
@@ -142,7 +142,7 @@ def learnt_motion(
                     return None
             if stop():
                 return None
-            motion = improved(motion, seen, fit.image)
+            motion = improved(motion, energies, fit.image)
             fit.move(motion)
     assert motion is not None
     nz, ny, nx = Grid.matching(views.geometry).shape
@@ -164,9 +164,9 @@ def _seen(views: EnergyViews, grid: Grid) -> list[Seen]:
     whole, data = Projector(views.geometry, grid), projection_lines(views.projections)
     weight = None if views.weight is None else projection_lines(views.weight)
     return [
-        Seen(int(e), whole.subset(at), data[at], None if weight is None else weight[at])
+        Seen(int(e), whole.subset(indices), data[indices], None if weight is None else weight[indices])
         for e in np.unique(views.energy)
-        for at in [np.flatnonzero(views.energy == e)]
+        for indices in [np.flatnonzero(views.energy == e)]
     ]
 
 
@@ -219,14 +219,14 @@ def register_energies(
             break
     assert moves is not None
     still = [Displacement()] * len(moves)
-    before, after = (judge(data, geometry, looked.energy, known, at).overall for at in (still, moves))
+    before, after = (judge(data, geometry, looked.energy, known, moves).overall for moves in (still, moves))
     progress(STEPS, STEPS)
     if not after < _HELPS * before:
         return views, tuple(still)
     least = 2 * _MOVES / views.projections.shape[2]
     moves_kept = [move if abs(move.magnification - 1) > least else replace(move, magnification=1.0) for move in moves]
-    seen = _unmagnified(views, moves_kept, (rows.start + looked.geometry.axis_row, views.geometry.axis_col))
-    return replace(seen, geometry=displaced(views.geometry, views.energy, moves_kept)), tuple(moves_kept)
+    unmagnified = _unmagnified(views, moves_kept, (rows.start + looked.geometry.axis_row, views.geometry.axis_col))
+    return replace(unmagnified, geometry=displaced(views.geometry, views.energy, moves_kept)), tuple(moves_kept)
 
 
 def _unmagnified(views: EnergyViews, moves: Sequence[Displacement], centre: tuple[float, float]) -> EnergyViews:
@@ -256,4 +256,4 @@ def _strengths(views: EnergyViews) -> F64:
 def _spread(energy: NDArray[np.intp]) -> NDArray[np.intp]:
     """Indices of evenly spread projections, at most `_VIEWS` per energy."""
     own = (np.flatnonzero(energy == e) for e in np.unique(energy))
-    return np.sort(np.concatenate([spread(at, _VIEWS) for at in own]))
+    return np.sort(np.concatenate([spread(own_views, _VIEWS) for own_views in own]))

@@ -54,7 +54,7 @@ class TimeSeries(Series):
         times = np.arange(n, dtype=np.float64) if times is None else np.asarray(times, np.float64)
         history = _History(self.sweeps, n, control)
         data, weights = _measured(problem)
-        made = fit_series(
+        volumes = fit_series(
             TimedViews(data, problem.geometry, times, weights),
             self.volumes,
             motion=self.moves,
@@ -64,14 +64,18 @@ class TimeSeries(Series):
             go_on=history.heard,
             stop=control.stop,
         )
-        series = VolumeSeries(made.times - times.min(), np.stack([made.at(at) for at in made.times]), made.residual)
-        settings: dict[str, Any] = {"volumes": self.volumes, "moves": made.motion is not None, "sweeps": self.sweeps}
-        settings |= {"view_seconds": times - times.min()} | ({} if made.smooth is None else {"smooth": made.smooth})
-        if made.unseen_residuals is None:
-            return history.result(series, made.grid, settings, made.at)
-        because = _because(*made.unseen_residuals, moves=made.motion is not None)
+        series = VolumeSeries(
+            volumes.times - times.min(), np.stack([volumes.at(time) for time in volumes.times]), volumes.residual
+        )
+        settings: dict[str, Any] = {"volumes": self.volumes, "moves": volumes.motion is not None, "sweeps": self.sweeps}
+        settings |= {"view_seconds": times - times.min()} | (
+            {} if volumes.smooth is None else {"smooth": volumes.smooth}
+        )
+        if volumes.unseen_residuals is None:
+            return history.result(series, volumes.grid, settings, volumes.at)
+        because = _because(*volumes.unseen_residuals, moves=volumes.motion is not None)
         settings["chosen_because"] = because
-        return replace(history.result(series, made.grid, settings, made.at), chosen=because)
+        return replace(history.result(series, volumes.grid, settings, volumes.at), chosen=because)
 
     def toy(self) -> Self:
         return replace(self, volumes=2, moves=True if self.moves is None else self.moves, sweeps=1)
@@ -113,12 +117,12 @@ class _History:
         self.control.tell(reached)
 
     def result(
-        self, series: VolumeSeries, grid: Grid, settings: dict[str, Any], at: Callable[[float], F32]
+        self, series: VolumeSeries, grid: Grid, settings: dict[str, Any], volume_at: Callable[[float], F32]
     ) -> Reconstruction:
         """The reconstruction with this history."""
         if not self.of_sweeps:  # the fit was stopped before its first iteration
             self.tell(0, series.residual)
-        return Reconstruction(Volume(series.data[0], grid), settings, self.of_sweeps, series=series, at=at)
+        return Reconstruction(Volume(series.data[0], grid), settings, self.of_sweeps, series=series, at=volume_at)
 
 
 def _measured(problem: ReconProblem) -> tuple[F32, F32 | None]:

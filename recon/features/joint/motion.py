@@ -67,17 +67,17 @@ class Motion:
     def at(self, time: int, control: F64 | None = None) -> F32:
         """The displacement u [3, y, x, z] at a time. `control` replaces the control points, if given."""
         y, x, z = (part.astype(np.float32) for part in self._space)
-        some = np.tensordot(self._shares[time], self.control if control is None else control, 1).astype(np.float32)
-        wide = np.einsum("yp,dpqr->dyqr", y, some)
+        part = np.tensordot(self._shares[time], self.control if control is None else control, 1).astype(np.float32)
+        wide = np.einsum("yp,dpqr->dyqr", y, part)
         wide = np.einsum("xq,dyqr->dyxr", x, wide)
         return np.ascontiguousarray(wide @ z.T)
 
     def back(self, time: int, field: F32) -> F64:
         """The transpose of `at`: from a field [3, y, x, z] to control points."""
         y, x, z = self._space
-        some = np.einsum("xq,dyxr->dyqr", x, (field @ z.astype(np.float32)).astype(np.float64))
-        some = np.einsum("yp,dyqr->dpqr", y, some)
-        return np.asarray(np.multiply.outer(self._shares[time], some))
+        gradient = np.einsum("xq,dyxr->dyqr", x, (field @ z.astype(np.float32)).astype(np.float64))
+        gradient = np.einsum("yp,dyqr->dpqr", y, gradient)
+        return np.asarray(np.multiply.outer(self._shares[time], gradient))
 
 
 def _spline(times: F64, knots: int) -> F64:
@@ -105,11 +105,11 @@ class Seen:
     weight: F32 | None
 
 
-def descent(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) -> tuple[F64, list[F32]]:
+def descent(motion: Motion, energies: Sequence[Seen], image: Callable[[int], F32]) -> tuple[F64, list[F32]]:
     """The negative gradient of half the weighted squares with respect to the control points, and the derivatives of W x
     with respect to u."""
     right, slope = np.zeros_like(motion.control), list[F32]()
-    for part in seen:
+    for part in energies:
         u, x = motion.at(part.time), image(part.time)
         residual = part.data - part.projector.forward_lines(moved(x, u))
         slope.append(np.empty_like(u))
@@ -118,24 +118,24 @@ def descent(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) -
     return right, slope
 
 
-def improved(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) -> Motion:
+def improved(motion: Motion, energies: Sequence[Seen], image: Callable[[int], F32]) -> Motion:
     """The motion after a Gauss-Newton step on the projections, with differences between control points kept small.
 
     Args:
         image: function that returns the volume [y, x, z] at a time, before it is displaced.
     """
-    right, slope = descent(motion, seen, image)
+    right, slope = descent(motion, energies, image)
 
     def curved(control: F64) -> F64:
         out = np.zeros_like(control)
-        for part, own in zip(seen, slope, strict=True):
+        for part, own in zip(energies, slope, strict=True):
             along = np.einsum("dyxz,dyxz->yxz", own, motion.at(part.time, control))
             lines = weighed(part.projector.forward_lines(along), part.weight)
             out += motion.back(part.time, own * part.projector.adjoint_lines(lines))
         return out
 
-    some = np.random.default_rng(0).standard_normal(motion.control.shape)
-    typical = float(np.vdot(some, curved(some)) / np.vdot(some, some))
+    start = np.random.default_rng(0).standard_normal(motion.control.shape)
+    typical = float(np.vdot(start, curved(start)) / np.vdot(start, start))
 
     def normal(control: F64) -> F64:
         return curved(control) + typical * _rough(control)
@@ -162,22 +162,22 @@ def _rough(control: F64) -> F64:
 
 
 def conjugate_gradients(
-    normal: Callable[[A], A], residual: A, found: A, steps: int, go_on: Callable[[], bool] = lambda: True
+    normal: Callable[[A], A], residual: A, solution: A, steps: int, go_on: Callable[[], bool] = lambda: True
 ) -> None:
-    """Make conjugate-gradient iterations (Hestenes & Stiefel 1952) that improve the solution `found` in place.
+    """Make conjugate-gradient iterations (Hestenes & Stiefel 1952) that improve `solution` in place.
 
     Args:
         left: the right side of the equations, minus `normal` of the present solution. It is overwritten.
         go_on: called before each iteration; False ends it.
     """
-    of_kind = found.dtype.type
+    of_kind = solution.dtype.type
     towards, squares = residual.copy(), float(np.vdot(residual, residual))
     for _ in range(steps):
         if squares == 0 or not go_on():
             break
         image = normal(towards)
         length = of_kind(squares / float(np.vdot(towards, image)))
-        found += length * towards
+        solution += length * towards
         residual -= length * image
         before, squares = squares, float(np.vdot(residual, residual))
         towards = residual + of_kind(squares / before) * towards

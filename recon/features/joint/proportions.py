@@ -41,19 +41,19 @@ class Countdown:
     """Reports to a listener how many steps may remain, and records whether the listener has ended the steps."""
 
     go_on: Callable[[int], bool]
-    left: int
+    remaining: int
     stop: Callable[[], bool] = lambda: False
     going: bool = True
 
     def __call__(self) -> bool:
-        self.left -= 1
-        self.going = self.going and self.go_on(max(0, self.left))
+        self.remaining -= 1
+        self.going = self.going and self.go_on(max(0, self.remaining))
         return self.going
 
     def end(self) -> None:
         """Report to the listener that no step follows."""
-        if self.going and self.left > 0:
-            self.left, self.going = 0, self.go_on(0)
+        if self.going and self.remaining > 0:
+            self.remaining, self.going = 0, self.go_on(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,16 +145,16 @@ class Proportions:
             smooth: λ divided by the mean curvature of the projections.
             go_on: called before each iteration; False ends it.
         """
-        found = factors.copy()
+        solution = factors.copy()
         with suppress(StoppedError):
             mean = float(np.vdot(self.explained(self.shown(self.ones())).sum(0), self.matter))
             weight = np.float32(smooth * mean / max(len(factors) * float(np.vdot(self.matter, self.matter)), 1e-30))
 
-            def normal(of: F32) -> F32:
-                return self.explained(self.shown(of)) + weight * self.rough(of)
+            def normal(proportions: F32) -> F32:
+                return self.explained(self.shown(proportions)) + weight * self.rough(proportions)
 
-            conjugate_gradients(normal, self.explained(self.data) - normal(found), found, steps, go_on)
-        return found
+            conjugate_gradients(normal, self.explained(self.data) - normal(solution), solution, steps, go_on)
+        return solution
 
 
 def smoothness(fit: Proportions, judge: Proportions, first: F32, go_on: Callable[[], bool]) -> tuple[float, float]:
@@ -178,10 +178,10 @@ def smoothness(fit: Proportions, judge: Proportions, first: F32, go_on: Callable
             best, worse = (tried[-1][1], 0) if tried[-1][1].sum() < best.sum() else (best, worse + 1)
             if worse == 2:
                 break
-    for smooth, left in tried:
-        apart = left - best
+    for smooth, residuals in tried:
+        apart = residuals - best
         if apart.sum() <= math.sqrt(apart.size) * apart.std(ddof=min(1, apart.size - 1)):
-            return smooth, float(left.sum())
+            return smooth, float(residuals.sum())
     return _HEAVIEST, math.inf
 
 
@@ -194,7 +194,7 @@ def fit_share(
     views: EnergyViews,
     found: Materials,
     states: tuple[int, int],
-    go_on: Callable[[int], bool] = lambda left: True,
+    go_on: Callable[[int], bool] = lambda remaining: True,
     stop: Callable[[], bool] = lambda: False,
 ) -> Materials:
     """Fit the densities of two states of one material again. The sum of both densities does not change; the fraction of
@@ -219,7 +219,7 @@ def fit_share(
         raise ValueError(f"states must be two different materials from 0 to {count - 1}, got {states}")
     steps = Countdown(go_on, STEPS, stop)
     smooth = _smoothness(views, found, states, steps)
-    steps.left = min(steps.left, SOLUTION_STEPS)
+    steps.remaining = min(steps.remaining, SOLUTION_STEPS)
     problem = share_problem(views, found.densities, states, found.grid)
     share = _even(problem)
     share = np.clip(volume_slices(replace(problem, stop=stop).solved(smooth, share, steps)[0]), 0, 1)
@@ -237,9 +237,9 @@ def share_problem(views: EnergyViews, densities: F32, states: tuple[int, int], g
     data = projection_lines(views.projections)
     depth = np.zeros_like(data)
     for material, density in enumerate(densities):
-        seen = projector.forward_lines(volume_lines(density))
-        depth += of_view[:, material] * seen
-        data = data - of_view[:, states[0] if material in states else material] * seen
+        lines = projector.forward_lines(volume_lines(density))
+        depth += of_view[:, material] * lines
+        data = data - of_view[:, states[0] if material in states else material] * lines
     weight = np.exp(-np.minimum(depth, _DEEPEST))
     if views.weight is not None:
         weight[projection_lines(views.weight) == 0] = 0
@@ -249,18 +249,18 @@ def share_problem(views: EnergyViews, densities: F32, states: tuple[int, int], g
 
 def _even(problem: Proportions) -> F32:
     """The share of each state, the same in the whole sample, that explains the mean of the projections best."""
-    one = problem.ones()
-    all_explained = float(problem.explained(problem.shown(one)).sum(dtype=np.float64))
+    ones = problem.ones()
+    all_explained = float(problem.explained(problem.shown(ones)).sum(dtype=np.float64))
     mean = float(problem.explained(problem.data).sum(dtype=np.float64)) / (all_explained or 1)
-    return np.float32(np.clip(mean, 0, 1)) * one
+    return np.float32(np.clip(mean, 0, 1)) * ones
 
 
-def _smoothness(views: EnergyViews, found: Materials, states: tuple[int, int], steps: Countdown) -> float:
-    rows, grid = slice(None), found.grid
+def _smoothness(views: EnergyViews, materials: Materials, states: tuple[int, int], steps: Countdown) -> float:
+    rows, grid = slice(None), materials.grid
     if grid.shape[0] == views.geometry.detector_shape[0]:
         rows, grid = trial_rows(views, grid, _ROWS)
-    some = views.select(np.arange(views.geometry.n_views), rows)
-    problem = share_problem(some, found.densities[:, rows], states, grid)
+    part = views.select(np.arange(views.geometry.n_views), rows)
+    problem = share_problem(part, materials.densities[:, rows], states, grid)
     held_out = views.parted(ONE_IN) == ONE_IN // 2
     first, problem = _even(problem), replace(problem, stop=steps.stop)
     fit, judge = problem.select(np.flatnonzero(~held_out)), problem.select(np.flatnonzero(held_out))

@@ -181,8 +181,8 @@ def fit_series(
     fit = EnergyFit(energies, grid, np.random.default_rng(seed), learnt, stop)
     heard = GoesOn(go_on)
     volumes, residual = fitted(fit, weights, sweeps, heard)
-    made = TimedVolumes(times, volumes, grid, residual, learnt, unseen)
-    return made if smooth is None or not heard.going or stop() else _as_factors(made, fit, smooth, go_on)
+    timed = TimedVolumes(times, volumes, grid, residual, learnt, unseen)
+    return timed if smooth is None or not heard.going or stop() else _as_factors(timed, fit, smooth, go_on)
 
 
 def _refuse_gaps(times: F64, knots: F64) -> None:
@@ -220,28 +220,30 @@ def _moves(still: F64, moved: F64) -> bool:
     return exceeds_standard_error(still - moved, _SURE) and float(moved.mean()) < _LESS * float(still.mean())
 
 
-def _as_factors(made: TimedVolumes, fit: EnergyFit, smooth: float, go_on: Callable[[int, float], bool]) -> TimedVolumes:
+def _as_factors(
+    timed: TimedVolumes, fit: EnergyFit, smooth: float, go_on: Callable[[int, float], bool]
+) -> TimedVolumes:
     """The volumes, replaced by their mean times smooth factors. If the steps are stopped, the volumes stay
     unchanged."""
-    stop, problem = fit.stop, _of_factors(fit.views, made.volumes, made.grid, fit.stop)
-    steps = Countdown(lambda after: go_on(-after, made.residual), SOLUTION_STEPS)
+    stop, problem = fit.stop, _of_factors(fit.views, timed.volumes, timed.grid, fit.stop)
+    steps = Countdown(lambda after: go_on(-after, timed.residual), SOLUTION_STEPS)
     factors = problem.solved(smooth, problem.ones(), steps)
     if not steps.going or stop():
-        return made
+        return timed
     fit.stop = lambda: False
     changed = np.stack([volume_slices(problem.matter * np.maximum(factor, 0)) for factor in factors])
-    return replace(made, volumes=changed, residual=fit.residual_of(changed), smooth=smooth)
+    return replace(timed, volumes=changed, residual=fit.residual_of(changed), smooth=smooth)
 
 
 def _of_factors(views: EnergyViews, volumes: F32, grid: Grid, stop: Callable[[], bool]) -> Proportions:
     """The problem of finding the factors of the mean volume. Rays that are strongly attenuated by the mean volume have
     less weight."""
-    projector, matter = Projector(views.geometry, grid), volume_lines(volumes.mean(0))
-    weight = weight_of(np.exp(-projector.forward_lines(matter)))
+    projector, density = Projector(views.geometry, grid), volume_lines(volumes.mean(0))
+    weight = weight_of(np.exp(-projector.forward_lines(density)))
     if views.weight is not None:
         weight *= projection_lines(views.weight) > 0
     data = projection_lines(views.projections)
-    return Proportions(projector, views.energy, views.cross_sections, matter, data, weight, stop)
+    return Proportions(projector, views.energy, views.cross_sections, density, data, weight, stop)
 
 
 def smooth_factors(
@@ -265,14 +267,16 @@ def smooth_factors(
     if not heard.going or stop():
         return None
     problem = _of_factors(views.select(np.arange(held_out.size), rows), free, grid, stop)
-    seen, judge = problem.select(np.flatnonzero(~held_out)), problem.select(np.flatnonzero(held_out))
+    to_fit, judge = problem.select(np.flatnonzero(~held_out)), problem.select(np.flatnonzero(held_out))
     steps = Countdown(lambda after: go_on(-after, residual), TRIAL_STEPS)
-    smooth, left = smoothness(seen, judge, seen.ones(), steps)
+    smooth, judged_squares = smoothness(to_fit, judge, to_fit.ones(), steps)
     steps.end()
     if not steps.going or stop():
         return None
-    alone = replace(judge, matter=np.ones_like(judge.matter)).left(np.stack([volume_lines(one) for one in free])).sum()
-    return smooth if left < _LESS * alone else None
+    alone = (
+        replace(judge, matter=np.ones_like(judge.matter)).left(np.stack([volume_lines(image) for image in free])).sum()
+    )
+    return smooth if judged_squares < _LESS * alone else None
 
 
 def refuse_few(knots: int, n: int) -> None:

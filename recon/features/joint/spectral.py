@@ -187,7 +187,7 @@ class _Trials:
         if not self.going:
             return weights
         limit = _AS_WELL * min(residuals)
-        return next(at for at, now in zip(ladder[::-1], residuals[::-1], strict=True) if now <= limit)
+        return next(weight for weight, now in zip(ladder[::-1], residuals[::-1], strict=True) if now <= limit)
 
 
 def weights_by_views(

@@ -28,7 +28,7 @@ def test_weak_matter_that_was_clipped_with_its_air_is_named_by_its_region() -> N
     assert found is not None
     (top, bottom), across, along = found.region
     assert top <= 10 and bottom >= 20 and max(across[0], along[0]) <= 22 and min(across[1], along[1]) >= 42
-    assert 0.2 < found.kept < 0.4  # 0.0015 - 0.001 of 0.0015
+    assert 0.2 < found.kept_share < 0.4  # 0.0015 - 0.001 of 0.0015
     assert lost_matter(shown, shown) is None
 
 

@@ -196,7 +196,7 @@ def test_a_step_on_all_views_takes_the_mean_gradient_and_the_sum_of_the_statisti
         expected = np.mean([single.first[name] for single in singles], axis=0)
         np.testing.assert_allclose(together.first[name], expected, atol=1e-5 * np.abs(expected).max())
     np.testing.assert_allclose(together.statistic, np.sum([each.statistic for each in singles], axis=0), rtol=1e-4)
-    assert together.seen == VIEWS.n_views
+    assert together.views_shown == VIEWS.n_views
 
 
 def test_the_misfit_of_all_views_is_the_root_mean_square_of_theirs(random_gaussians: Make) -> None:

@@ -49,24 +49,24 @@ def problem(rng: np.random.Generator) -> ReconProblem:
 def test_a_fit_that_voxels_lead_ends_after_a_quarter_of_its_steps(problem: ReconProblem) -> None:
     poor = Poor()
     choice = Auto((Fbp(), FistaTv(), PnpDct(), poor)).choose(problem, RunControl())
-    assert choice.at in (1, 2) and choice.prior is not None and choice.prior.weight > 0
+    assert choice.chosen in (1, 2) and choice.prior is not None and choice.prior.weight > 0
     assert poor.views == [26]  # views held out are not fitted
     assert "r2 stopped after 25% of its steps" in choice.reason and "a full test takes about" in choice.reason
     poor.views.clear()
     choice = Auto((FistaTv(), poor), least_gain=0.0).choose(problem, RunControl())
-    assert choice.at == 0 and poor.views == [26, 26] and "stopped" not in choice.reason
+    assert choice.chosen == 0 and poor.views == [26, 26] and "stopped" not in choice.reason
 
 
 def test_few_views_and_a_stop_choose_nothing(problem: ReconProblem) -> None:
     few = replace(problem, views=problem.views.select(np.arange(12)))
     none = Auto().choose(few, RunControl())
-    assert none.at is None and none.prior is None and "12 projections are too few" in none.reason
+    assert none.chosen is None and none.prior is None and "12 projections are too few" in none.reason
     looks = iter([False] * 30)
     stopped = Auto().choose(problem, RunControl(lambda: next(looks, True)))
-    assert stopped.at is None and stopped.reason == "stopped before the choice"
+    assert stopped.chosen is None and stopped.reason == "stopped before the choice"
 
 
 def test_a_fit_with_a_finish_of_its_own_is_run_as_it_is(problem: ReconProblem) -> None:
     poor = Poor(finish=5)
     choice = Auto((FistaTv(), poor)).choose(problem, RunControl())
-    assert choice.at == 0 and poor.views == [26] and "stopped" not in choice.reason
+    assert choice.chosen == 0 and poor.views == [26] and "stopped" not in choice.reason

@@ -115,9 +115,9 @@ def test_volume_and_outside_together_explain_the_views(
 def test_a_given_radius_is_taken(wide: tuple[np.ndarray, np.ndarray]) -> None:
     made = recon.reconstruct(wide[0], GEOMETRY, METHOD, use=DataUse(sample_radius=55.0))
     assert made.settings["sample_radius"] == made.settings["sample_radius_high"] == 55.0
-    assert whole_reach(Views(wide[0], GEOMETRY), given=20.0).sample is None  # within the field
+    assert whole_reach(Views(wide[0], GEOMETRY), sample_radius=20.0).sample is None  # within the field
     known = SampleRadius(50.0, 48.0, 53.0, 0.02)
-    assert whole_reach(Views(wide[0], GEOMETRY), given=known).sample is known
+    assert whole_reach(Views(wide[0], GEOMETRY), sample_radius=known).sample is known
 
 
 @pytest.mark.slow

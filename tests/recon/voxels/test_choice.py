@@ -25,7 +25,7 @@ from recon.voxels.choice import (
 def simplest_within_one_se(residuals: Sequence[NDArray[np.float64] | None], least_gain: float = 0.02) -> int | None:
     """Number of the candidate that a choice takes."""
     given = (Prediction("", None if each is None else each.tolist()) for each in residuals)
-    return TrialChoice("", least_gain, tuple(given)).at
+    return TrialChoice("", least_gain, tuple(given)).chosen
 
 
 SCATTER = np.array([-0.3, 0.1, 0.4, -0.2, 0.0])  # of views, which all candidates share
@@ -131,13 +131,13 @@ def test_a_choice_is_the_same_from_a_file() -> None:
         Prediction("r2", (1 + SCATTER).tolist(), None, "r2 stopped"),
     ):
         choice = choice.after(prediction)
-    assert (choice.at, choice.prior) == (2, None)
+    assert (choice.chosen, choice.prior) == (2, None)
     assert choice.reason.startswith(
         "test reconstructions of 16 rows, root mean square residual in held-out projections"
     )
     assert choice.reason.endswith("fista-tv 2.000; r2 1.000; fbp: not these; r2 stopped")
     again = TrialChoice.of(json.loads(json.dumps(choice)))
-    assert (again.at, again.reason) == (choice.at, choice.reason)
+    assert (again.chosen, again.reason) == (choice.chosen, choice.reason)
     assert again.predictions[1].prior == Prior(0.1)
     assert again.least is not None and again.least.mean() == pytest.approx(1.0)
-    assert TrialChoice("no views").at is None and TrialChoice("no views").reason == "no views"
+    assert TrialChoice("no views").chosen is None and TrialChoice("no views").reason == "no views"

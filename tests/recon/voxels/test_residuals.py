@@ -43,8 +43,8 @@ def test_the_residual_of_all_views_is_the_root_of_the_ratio_of_their_sums() -> N
     views[1] = 4.0
     even = ViewResolution.of(Geometry.parallel(np.zeros(2), (2, 4)), Grid((2, 4, 4)))
     found = squares_left(np.full_like(views, 3.0), views, None, even)
-    np.testing.assert_allclose(found.left, 8.0)
+    np.testing.assert_allclose(found.squares, 8.0)
     np.testing.assert_allclose(found.own, [32.0, 128.0])
     assert found.rays.tolist() == [8, 8] and found.residual == pytest.approx(np.sqrt(16 / 160))
     with pytest.raises(ValueError, match="all projections are zero"):
-        _ = SquaresLeft(found.left, np.zeros(2), found.rays).residual
+        _ = SquaresLeft(found.squares, np.zeros(2), found.rays).residual

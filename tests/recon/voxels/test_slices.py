@@ -36,11 +36,11 @@ def test_they_are_slices_of_the_volume_through_its_matter(name: str) -> None:
     slices, volume = orthogonal_slices(list(data), geometry), fbp(data, geometry, None, "hann")
     k, j, i = (
         int(np.argmin(np.abs(axis - at)))
-        for axis, at in zip(Grid.matching(geometry).coordinates(), slices.at, strict=True)
+        for axis, at in zip(Grid.matching(geometry).coordinates(), slices.centre, strict=True)
     )
     for image, cut in zip(slices.images, (volume[k], volume[:, j], volume[:, :, i]), strict=True):
         assert image == pytest.approx(cut, abs=1e-5 * float(volume.max()))
-    assert slices.at[1:] == pytest.approx((8 * PITCH, 5 * PITCH), abs=PITCH)
+    assert slices.centre[1:] == pytest.approx((8 * PITCH, 5 * PITCH), abs=PITCH)
     assert np.degrees(slices.covered) == pytest.approx(covered, abs=2.5)
 
 

@@ -57,7 +57,7 @@ def test_gains_are_found_and_the_ball_on_the_axis_stays(gains: F32) -> None:
     ringed = clean + gains
     found = learn_gains(ringed, GEOMETRY)
     far = np.abs(np.arange(SHAPE[1]) - MIDDLE) > NEAR_AXIS
-    assert found.confirmed and found.left < found.without
+    assert found.confirmed and found.with_gains < found.without
     assert _rms((found.pixels - gains)[:, far]) < 0.65 * _rms(gains)
     assert not found.pixels[:, ~far].any()
     views = {"gains": ringed - found.pixels}
