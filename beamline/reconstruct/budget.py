@@ -32,29 +32,35 @@ def in_budget(
     """
     end = now() + budget
     timing = Timing(geometry, grid, now, _TIMED_VOXELS)
-    kept, seconds, refused = list[Method](), dict[str, float](), list[str]()
+    affordable, seconds, refused = list[Method](), dict[str, float](), list[str]()
     for each in method.alternatives:
         try:
             seconds[each.name] = timing.of(each).most
-            kept.append(each)
+            affordable.append(each)
         except ValueError as error:
             refused.append(f"{each.name}: {error}")
-    if not kept:
+    if not affordable:
         raise ValueError("; ".join(refused))
-    chosen, expected = _without_slow(method, kept), 0.0
-    while (expected := timing.of(chosen).most) > end - now() and len(kept) > 1:
-        kept.remove(max(kept, key=lambda each: seconds[each.name]))
-        chosen = _without_slow(method, kept)
+    chosen, expected = _without_slow(method, affordable), 0.0
+    while (expected := timing.of(chosen).most) > end - now() and len(affordable) > 1:
+        affordable.remove(max(affordable, key=lambda each: seconds[each.name]))
+        chosen = _without_slow(method, affordable)
     if (late := expected - (end - now())) > 0:
         warn(
-            f"{duration_text(budget)} is too short for this scan: even the fastest method, {kept[0].name}, which "
+            f"{duration_text(budget)} is too short for this scan: even the fastest method, {affordable[0].name}, which "
             f"is used now, will end about {duration_text(late)} after this limit."
         )
-    names = [each.name for each in kept]
-    out = [f"{name} would take about {duration_text(some)}" for name, some in seconds.items() if name not in names]
+    names = [each.name for each in affordable]
+    out = [
+        f"{name} would take about {duration_text(duration)}" for name, duration in seconds.items() if name not in names
+    ]
     return chosen, "; ".join((f"{duration_text(budget)} for {' or '.join(names)}", *out))
 
 
-def _without_slow(method: Method, kept: list[Method]) -> Method:
-    """The method that chooses only among `kept`; if only one method is left, that method."""
-    return kept[0] if len(kept) == 1 else cast(Method, replace(cast(Any, method), candidates=tuple(kept)))
+def _without_slow(method: Method, affordable: list[Method]) -> Method:
+    """The method that chooses only among `affordable`; if only one method is left, that method."""
+    return (
+        affordable[0]
+        if len(affordable) == 1
+        else cast(Method, replace(cast(Any, method), candidates=tuple(affordable)))
+    )

@@ -40,7 +40,9 @@ def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str,
         "length_unit": prepared.origin.length_unit,
     }
     out |= arrays_of(prepared.geometry)
-    volumes = {each.name: of for each in fields(settings) if isinstance(of := getattr(settings, each.name), Volume)}
+    volumes = {
+        each.name: setting for each in fields(settings) if isinstance(setting := getattr(settings, each.name), Volume)
+    }
     plain = asdict(replace(settings, **dict.fromkeys(volumes)) if volumes else settings)
     out |= {f"setting {name}": str(value) for name, value in plain.items() if name not in volumes}
     for name, volume in volumes.items():
@@ -113,22 +115,22 @@ class CheckpointOptions:
         """
         if self.resume is None:
             return None
-        kept, reached = _read_state(self.resume)
-        refuse_other(self.resume, origin, kept.made_from, "fit")
+        saved, reached = _read_state(self.resume)
+        refuse_other(self.resume, origin, saved.made_from, "fit")
         if 0 < steps < reached.step:
             raise ConfigError(
                 f"--resume {self.resume} already contains {reached.step} steps, more than the {steps} steps that "
                 f"you requested. Use --steps {reached.step} or more, or start again without --resume."
             )
-        if steps != kept.steps or steps == 0:
-            was, now = (f"{n} steps" if n else "a time limit" for n in (kept.steps, steps))
+        if steps != saved.steps or steps == 0:
+            was, now = (f"{n} steps" if n else "a time limit" for n in (saved.steps, steps))
             plans = (
                 f"that was planned for {was}, and this fit is planned for {now}"
                 if was != now
                 else "that was planned for a time limit, like this fit"
             )
             warn(f"The checkpoint is from a fit {plans}: the learning rates continue at the same step of the new plan.")
-        return kept.state
+        return saved.state
 
     def write(self, origin: Mapping[str, Value], steps: int, warn: Warn, state: Mapping[str, NDArray[Any]]) -> str:
         """Write the checkpoint and return "". If the disk refuses, the fit continues: the function warns and returns
@@ -150,10 +152,10 @@ def _read_state(path: Path) -> tuple[Checkpoint, FitState]:
     Raises:
         DataError: there is no checkpoint, or it does not contain a state to resume from.
     """
-    kept = read_checkpoint(path)
+    saved = read_checkpoint(path)
     try:
-        reached = state_from(kept.state)
-        for name, values in kept.state.items():
+        reached = state_from(saved.state)
+        for name, values in saved.state.items():
             # The last loss, and the best one of the held-out views, may be NaN; a Gaussian's exponent is infinite.
             if name not in ("scalars", "watch", "kernel_exponent") and not np.isfinite(values).all():
                 raise ValueError(f"{name} of the checkpoint has values that are not finite")
@@ -164,15 +166,15 @@ def _read_state(path: Path) -> tuple[Checkpoint, FitState]:
             f"The checkpoint {path} is damaged: {error}. Resume from another checkpoint, or start again without "
             "--resume."
         ) from error
-    return kept, reached
+    return saved, reached
 
 
-def refuse_other(path: Path, now: Mapping[str, Value], before: Mapping[str, Value], of: str) -> None:
-    """Raise DataError with the differences if a file has another origin; `of` names the content of the file."""
+def refuse_other(path: Path, now: Mapping[str, Value], before: Mapping[str, Value], made_by: str) -> None:
+    """Raise DataError with the differences if a file has another origin; `made_by` names the content of the file."""
     others = differences(now, before)
     if others:
         listed = "; ".join(others[:6]) + (f"; and {len(others) - 6} more" if len(others) > 6 else "")
         raise DataError(
-            f"{path} was written for another {of}, so it cannot be resumed: {listed}. Use the same options as then, or "
-            "start again without --resume. No file was changed."
+            f"{path} was written for another {made_by}, so it cannot be resumed: {listed}. Use the same options as "
+            "then, or start again without --resume. No file was changed."
         )

@@ -62,7 +62,7 @@ class Contradiction(NamedTuple):
     why: str
 
 
-def contradiction(given: Collection[str]) -> Contradiction | None:
+def contradiction(options: Collection[str]) -> Contradiction | None:
     """The first two of the given options that exclude each other, in the order of the table; None: there are none."""
     pairs = (Contradiction(name, *each) for name, others in EXCLUDED.items() for each in others.items())
-    return next((pair for pair in pairs if pair.name in given and pair.other in given), None)
+    return next((pair for pair in pairs if pair.name in options and pair.other in options), None)

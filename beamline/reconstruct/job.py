@@ -304,11 +304,11 @@ def _of_preset(job: Job, result: Reconstruction) -> str:
         return ""
     if job.options.quality is not None:
         return f"{job.options.quality}: {method.steps} steps from {started_from} Gaussians"
-    asked = method.gaussians
-    if isinstance(asked, int) and job.options.checkpoints.resume is None and started_from < asked:
+    requested = method.gaussians
+    if isinstance(requested, int) and job.options.checkpoints.resume is None and started_from < requested:
         job.channels.warn(
-            f"The fit started with {started_from} Gaussians instead of {asked}, because the sample is too small for "
-            "more."
+            f"The fit started with {started_from} Gaussians instead of {requested}, because the sample is too small "
+            "for more."
         )
     return ""
 

@@ -67,7 +67,7 @@ def _prepared(live: LiveScan, state: Feeds, scan: SelectedScan, usable: UsableVi
         if isinstance(step, ScanStep):
             try:
                 angles = live.source.table.angles[projections.view_ids]
-                done[step.name] = step.apply(prepared, angles, lambda n, of: None)
+                done[step.name] = step.apply(prepared, angles, lambda n, total: None)
             except DataError as error:  # the error is not a reason to discard the volume
                 live.warn(str(error))
                 continue

@@ -83,9 +83,9 @@ def middle_of(views: Sequence[F32], geometry: Geometry) -> Views:
     """The middle rows of projections, binned to at most 256 columns."""
     rows, cols = geometry.detector_shape
     factor = min(math.ceil(cols / _SIDE), rows)
-    some = min(rows, _ROWS * factor)
-    first = (rows - some) // 2
-    part = geometry.rows(first, first + some).binned(factor)
+    n_rows = min(rows, _ROWS * factor)
+    first = (rows - n_rows) // 2
+    part = geometry.rows(first, first + n_rows).binned(factor)
     n, m = part.detector_shape
     data = np.stack([np.asarray(view[first : first + n * factor, : m * factor], np.float32) for view in views])
     return Views(data.reshape(len(data), n, factor, m, factor).mean((2, 4)), part)

@@ -214,8 +214,8 @@ def corrected_again(
     """
     correction, source = state.correction, live.source
     ids = np.concatenate([batch.view_ids for batch in state.batches])
-    kept = np.flatnonzero(np.isin(ids, usable.frames))
-    frames = ids[kept]
+    usable_indices = np.flatnonzero(np.isin(ids, usable.frames))
+    frames = ids[usable_indices]
     gone = ids.size - frames.size
     shaded = ignores_shadow(correction, frames)
     if not (gone or shaded or wide.size or outdated(correction) or source.table.part_starts.size > 1):
@@ -233,7 +233,7 @@ def corrected_again(
     again = apply(correction.plan, every, warn=live.warn)
     state.batches.append(again)
     ordinary = again.measured[~np.isin(again.view_ids, wide)] if wide.size else again.measured
-    state.fit.replace_views(ordinary, kept if gone else None)
+    state.fit.replace_views(ordinary, usable_indices if gone else None)
     return replace(state, correction=correction)
 
 

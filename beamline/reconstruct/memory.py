@@ -96,10 +96,10 @@ class ReconMemory:
         less.
         """
         halo = self.method.halo
-        seen = min(height + 2 * (max(halo, HALO) if self.bars else halo), self.rows)
-        part = self.geometry.rows(0, seen)
+        n_rows = min(height + 2 * (max(halo, HALO) if self.bars else halo), self.rows)
+        part = self.geometry.rows(0, n_rows)
         rays = (1 + self.weighted) * 4 * part.n_views * math.prod(part.detector_shape)
-        work = self._work(self.method.for_part(seen / self.rows, seen / self.rows), part, self._grid(seen))
+        work = self._work(self.method.for_part(n_rows / self.rows, n_rows / self.rows), part, self._grid(n_rows))
         return self.weights + rays + work
 
     def _work(self, method: Method, geometry: Geometry, grid: Grid) -> int:
@@ -194,8 +194,8 @@ def refuse_whole(scan: SelectedScan, options: ReconOptions, needs: ReconMemory, 
         "--checkpoint and --resume": options.checkpoints.wanted,
         "--early-stop": options.method.stops_early,
     }
-    for option, given in whole.items():
-        if given:
+    for option, used in whole.items():
+        if used:
             raise ConfigError(
                 f"{option} needs the whole scan in memory: {scan.source.path} needs {size(needs.at_once)}, but "
                 f"{size(memory)} is allowed. Leave out this option, or use --bin {2 * options.selection.binning} "
@@ -225,10 +225,10 @@ def cluster(spec: str) -> AbstractContextManager[Any]:
     Raises:
         ConfigError: the add-on is not installed.
     """
-    found = plugins("workers", ())
-    if "cluster" not in found:
+    workers = plugins("workers", ())
+    if "cluster" not in workers:
         raise ConfigError(f"--cluster {add_on_missing('cluster')}. Nothing was read.")
-    connected: AbstractContextManager[Any] = found["cluster"](spec)
+    connected: AbstractContextManager[Any] = workers["cluster"](spec)
     return connected
 
 

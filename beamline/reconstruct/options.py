@@ -161,12 +161,12 @@ class ReconOptions:
     @property
     def given(self) -> frozenset[str]:
         """What these options ask for, by its names in `combinations.EXCLUDED`."""
-        asked = {
+        values = {
             "follow": self.follow, "budget": self.budget, "quality": self.quality, "reference": self.reference,
             "volumes": self.method.volumes > 1, "uncertainty": self.uncertainty, "truth": self.truth,
             "roi": self.region, "cluster": self.cluster, "memory": self.memory, SLABS_RESUMED: self.partial,
         }  # fmt: skip
-        return frozenset(name for name, value in asked.items() if value not in (None, False))
+        return frozenset(name for name, value in values.items() if value not in (None, False))
 
     def disk_needs(self, volume: int, *, in_slabs: bool) -> tuple[int, int]:
         """(bytes on disk for the result, bytes for temporary files), for a volume of `volume` bytes."""

@@ -127,8 +127,8 @@ def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: Follow
             if should_stop():
                 raise KeyboardInterrupt("stopped before the scan had ended; nothing was written")
         if drawn is not None:
-            said = "The picture shows all projections of the scan"
-            channels.sink(StateEntered(ALL_SHOWN, said, time=channels.clock.now()))
+            message = "The picture shows all projections of the scan"
+            channels.sink(StateEntered(ALL_SHOWN, message, time=channels.clock.now()))
     return replace(options, follow=None)
 
 
@@ -265,8 +265,8 @@ def _for_method(
         )
     if options.method.stops_early and not prepared.lines.held_out.size:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
-        n, of = prepared.n_used, prepared.origin.n_projections
-        message = f"{of - n} of {of} projections are held out to decide when to stop"
+        n, total = prepared.n_used, prepared.origin.n_projections
+        message = f"{total - n} of {total} projections are held out to decide when to stop"
         channels.sink(StateEntered("held_out", message, time=channels.clock.now()))
     options.target.require_room(plan.output, plan.scratch - plan.line_integrals)  # line integrals are stored already
     return prepared
@@ -323,20 +323,20 @@ def reconstruct_file(
             fit_truth(truth_given, Grid.matching(job.prepared.geometry), options.selection.binning)
         decided = Decisions(options.seed)
         with job.stopping() as stopped, warnings_shown(channels.warn):
-            made, prepared = volume_of(replace(job, stop=Stop(stopped)), decided)
+            result, prepared = volume_of(replace(job, stop=Stop(stopped)), decided)
         if options.uncertainty:
             job.channels.phases.enter("error bars")
             with stop_scope() as stopped, warnings_shown(channels.warn):
-                made = with_error_bars(replace(job, stop=Stop(stopped)), made, decided)
+                result = with_error_bars(replace(job, stop=Stop(stopped)), result, decided)
         joined = round(prepared.geometry.pixel_pitch / job.prepared.geometry.pixel_pitch)
         selection = replace(job.options.selection, binning=options.selection.binning * joined)
-        truth = None if truth_given is None else fit_truth(truth_given, made.volume.grid, selection.binning)
+        truth = None if truth_given is None else fit_truth(truth_given, result.volume.grid, selection.binning)
         context = ReportContext(
             job.facts(), selection, options.command, options.seed, channels.warn.messages, channels.started,
             recipe=options.recipe, region=job.region, phases=job.channels.phases, leaves=job.leaves,
             filter=options.filter,
         )  # fmt: skip
         with job.stopping():  # the volume is complete: the first signal no longer discards it
-            record = write_result(MadeVolume(made, prepared, truth, options.target, context), sink, clock)
-        del made, prepared  # Windows does not remove a file that is mapped
+            record = write_result(MadeVolume(result, prepared, truth, options.target, context), sink, clock)
+        del result, prepared  # Windows does not remove a file that is mapped
     return record

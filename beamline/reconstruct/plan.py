@@ -306,8 +306,8 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
 
 def _refuse_contradictions(options: ReconOptions) -> None:
     """Raise ConfigError for options that exclude each other, and for a file that cannot contain several volumes."""
-    if (found := contradiction(options.given)) is not None:
-        raise ConfigError(f"{found.name} cannot be combined with {found.other}: {found.why}. Nothing was computed.")
+    if (pair := contradiction(options.given)) is not None:
+        raise ConfigError(f"{pair.name} cannot be combined with {pair.other}: {pair.why}. Nothing was computed.")
     target = options.target
     if options.method.volumes > 1 and target.written and target.output.suffix.lower() not in SUFFIXES:
         raise ConfigError(

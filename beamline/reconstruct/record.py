@@ -55,7 +55,7 @@ def arrays_of_model(gaussians: Gaussians, geometry: Geometry) -> dict[str, Any]:
     }
 
 
-def write_result(made: MadeVolume, sink: Sink, clock: Clock) -> ReconRecord:
+def write_result(outcome: MadeVolume, sink: Sink, clock: Clock) -> ReconRecord:
     """Assess the volume, write its file and the report, and send the event `done` with the returned record.
 
     The voxels of the record are read from the file when they are used. If no file is written, the record contains the
@@ -65,12 +65,16 @@ def write_result(made: MadeVolume, sink: Sink, clock: Clock) -> ReconRecord:
         DataError: the volume could not be written; no incomplete file remains. If only the report fails, a warning is
             given instead.
     """
-    phases, target, ordinary = made.context.phases, made.target, replace(made, prepared=made.prepared.centred)
+    phases, target, ordinary = (
+        outcome.context.phases,
+        outcome.target,
+        replace(outcome, prepared=outcome.prepared.centred),
+    )
     phases.enter("checking the volume")
     checked = check_volume(ordinary, sink, clock)
     remarks = [*checked.warnings, *([checked.skipped_text] if checked.skipped_text else [])]
-    context = replace(made.context, warnings=remarks)
-    record, volumes = _record(replace(made, context=context), checked, clock.now())
+    context = replace(outcome.context, warnings=remarks)
+    record, volumes = _record(replace(outcome, context=context), checked, clock.now())
     phases.enter("writing the volume")
     if target.written:
         write_volume(target.output, record, replace=target.replace)
@@ -95,25 +99,25 @@ def write_result(made: MadeVolume, sink: Sink, clock: Clock) -> ReconRecord:
 
 
 def _report(
-    made: MadeVolume, checked: CheckedVolume, volumes: Mapping[str, Volume], parameters: Mapping[str, Value]
+    outcome: MadeVolume, checked: CheckedVolume, volumes: Mapping[str, Volume], parameters: Mapping[str, Value]
 ) -> Callable[[float], None]:
     """Write the page. Returns a function that writes on the page how long the whole command took (in s)."""
     from beamline.reconstruct.report import compose  # imported here, because matplotlib takes a second
     from beamline.report.html import write_report, write_timed
 
-    target = made.target
+    target = outcome.target
     assert target.report is not None
-    report = compose(made, volumes, checked, parameters)
+    report = compose(outcome, volumes, checked, parameters)
     report = replace(report, volume=target.output.name if target.written else "")
     write_report(target.report, report, replace=target.replace)
-    return partial(write_timed, target.report, report, label_of(made.result.method))
+    return partial(write_timed, target.report, report, label_of(outcome.result.method))
 
 
-def _record(made: MadeVolume, checked: CheckedVolume, now: float) -> tuple[ReconRecord, dict[str, Volume]]:
+def _record(outcome: MadeVolume, checked: CheckedVolume, now: float) -> tuple[ReconRecord, dict[str, Volume]]:
     """The record of the volume, and the volumes of the report by method. If the options ask for a region, they are
     those of the region.
     """
-    result, prepared, target, context = made.result, made.prepared, made.target, made.context
+    result, prepared, target, context = outcome.result, outcome.prepared, outcome.target, outcome.context
 
     def written(volume: Volume) -> Volume:
         return prepared.stretched(volume if context.region is None else context.region.cut(volume))
@@ -126,7 +130,7 @@ def _record(made: MadeVolume, checked: CheckedVolume, now: float) -> tuple[Recon
         title=_title(result, context),
         sample=context.facts.sample or "not stated",
         time=now,
-        parameters=parameters_of(made),
+        parameters=parameters_of(outcome),
         metrics=checked.metrics[result.method],
         history=history_arrays(result.history),
         model={} if result.gaussians is None else arrays_of_model(result.gaussians, prepared.geometry),
@@ -156,8 +160,8 @@ def _with_voxels_in_files(record: ReconRecord, target: OutputPaths) -> ReconReco
     """
     volume, series = record.volume, record.series
     if target.written:
-        at = None if series is None else 0
-        voxels: Any = VoxelsInFile(volume.grid.shape, partial(_voxels, target.output, at))
+        time_index = None if series is None else 0
+        voxels: Any = VoxelsInFile(volume.grid.shape, partial(_voxels, target.output, time_index))
         volume = replace(volume, data=voxels)
         if series is not None:
             series = replace(series, data=VoxelsInFile(series.data.shape, partial(_dataset, target.output)))
@@ -177,9 +181,9 @@ def _dataset(path: Path, part: Any) -> NDArray[np.float32]:
         return np.asarray(file["entry/data/data"][part])
 
 
-def parameters_of(made: MadeVolume) -> dict[str, Value]:
+def parameters_of(outcome: MadeVolume) -> dict[str, Value]:
     """All parameters of the volume, by name."""
-    result, prepared, context = made.result, made.prepared, made.context
+    result, prepared, context = outcome.result, outcome.prepared, outcome.context
     selection, geometry, facts = context.selection, prepared.geometry, context.facts
     done, cols = recorded(in_order(selection), prepared.origin.done), geometry.detector_shape[1]
     parameters: dict[str, Value] = {
@@ -246,12 +250,12 @@ def partly_seen(geometry: Geometry) -> NDArray[np.intp]:
 
 def partly_seen_warning(geometry: Geometry) -> str:
     """The warning that some slices are seen in few projections; empty if all slices are seen equally."""
-    some = partly_seen(geometry)
-    if not some.size:
+    partial_slices = partly_seen(geometry)
+    if not partial_slices.size:
         return ""
     return (
-        f"Slices {spans(some.tolist())} of {Grid.matching(geometry).shape[0]} are seen from fewer angles than "
-        "the others, because the projections are at different heights. The volume has streaks in these slices, "
+        f"Slices {spans(partial_slices.tolist())} of {Grid.matching(geometry).shape[0]} are seen from fewer angles "
+        "than the others, because the projections are at different heights. The volume has streaks in these slices, "
         "and FBP gives too low densities."
     )
 

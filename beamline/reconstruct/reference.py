@@ -50,27 +50,27 @@ def with_reference(
         folder = options.target.output.parent
         # one reference for all states of a series
         folder = folder.parent if is_series_folder(folder.parent) else folder
-        made = folder / f"{safe_name(path.stem)}_reference.h5"
-        if made == options.target.output:
+        volume_path = folder / f"{safe_name(path.stem)}_reference.h5"
+        if volume_path == options.target.output:
             raise DataError(
-                f"The reference {path.name} is a scan. Its volume would be written to {made}, but this is also the "
-                f"output. Name another output. Nothing was computed."
+                f"The reference {path.name} is a scan. Its volume would be written to {volume_path}, but this is also "
+                f"the output. Name another output. Nothing was computed."
             )
         if _too_few(options):
             return options  # the method reports this, and does not use a reference
-        if not made.exists():
-            said = f"The reference {path.name} is a scan: it is reconstructed first, into {made.name}"
-            sink(StateEntered("reference", said, {"reference": made}, time=clock.now()))
-            target, source = OutputPaths(made, None), SourceOptions(path)
+        if not volume_path.exists():
+            message = f"The reference {path.name} is a scan: it is reconstructed first, into {volume_path.name}"
+            sink(StateEntered("reference", message, {"reference": volume_path}, time=clock.now()))
+            target, source = OutputPaths(volume_path, None), SourceOptions(path)
             first = ReconOptions(source, target, Selection(), Auto(), seed=options.seed, memory=options.memory)
             record = reconstruct(first, lambda event: None if isinstance(event, VolumeDone) else sink(event))
             if record.ended_early:  # a reference that ended early is poor, and later calls would use it
-                made.unlink()
+                volume_path.unlink()
                 raise ScanStopped(
-                    f"The reconstruction of the reference {path.name} was stopped, so its volume {made} was removed. "
-                    "The state was not reconstructed."
+                    f"The reconstruction of the reference {path.name} was stopped, so its volume {volume_path} was "
+                    "removed. The state was not reconstructed."
                 )
-        path = _of_this_scan(made, path)
+        path = _of_this_scan(volume_path, path)
     with opened_volume(path) as record:
         if record.kind is not VoxelKind.ATTENUATION or record.series is not None:
             raise DataError(f"{path} is not a single volume of attenuation; give a volume that recon wrote.")
@@ -91,12 +91,12 @@ def _too_few(options: ReconOptions) -> bool:
         return stated_geometry(select(source, options.selection)).n_views < LEAST_VIEWS
 
 
-def _of_this_scan(made: Path, scan: Path) -> Path:
+def _of_this_scan(volume_path: Path, scan: Path) -> Path:
     """The path of a volume. Raises DataError if it was made from another scan."""
-    with opened_volume(made) as record:
+    with opened_volume(volume_path) as record:
         if not same_file(Path(record.raw_file), scan):
             raise DataError(
-                f"{made} was made from {record.raw_file}, not from {scan.resolve()}. Move it away, or give the volume "
-                "of the reference instead of its scan. Nothing was changed."
+                f"{volume_path} was made from {record.raw_file}, not from {scan.resolve()}. Move it away, or give the "
+                "volume of the reference instead of its scan. Nothing was changed."
             )
-    return made
+    return volume_path

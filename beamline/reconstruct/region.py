@@ -105,13 +105,13 @@ def rows_around(scan: SelectedScan, region: Region, halo: int) -> SelectedScan:
         )
     poses = stated_poses(scan)
     moving = [(step, term) for step in geometry_steps(selection) for term in ("roll", "tilt", "shifts")]
-    given = [f"{step.asked_by} {term}" for step, term in moving if term in step.geometry]
+    obstacles = [f"{step.asked_by} {term}" for step, term in moving if term in step.geometry]
     if poses is not None and (poses.shifts[:, 1].any() or poses.leans):
-        given.append("--poses along the axis, or with roll, tilt or vectors")
-    if given:
+        obstacles.append("--poses along the axis, or with roll, tilt or vectors")
+    if obstacles:
         raise ConfigError(
-            f"--roi needs slices that are aligned with rows, and {' and '.join(given)} may misalign them. Use --rows "
-            "instead of --roi, or leave out the other option. Nothing was read."
+            f"--roi needs slices that are aligned with rows, and {' and '.join(obstacles)} may misalign them. Use "
+            "--rows instead of --roi, or leave out the other option. Nothing was read."
         )
     rows, side, (first, end) = selection.detector_rows, selection.binning, region.z
     slices = (rows.stop - rows.start) // side
@@ -257,8 +257,8 @@ def _hull(material: Mask, geometry: Geometry, grid: Grid, coarse: int) -> Mask:
     """[y, x], True for coarse voxels of the grid that lie in the shadow of most views in at least one band of rows."""
     cols = np.arange(material.shape[2])
     n = -(-grid.shape[2] // coarse)
-    at = (grid.coordinates()[2][0] / grid.voxel_size + (coarse - 1) / 2 + coarse * np.arange(n)) / coarse
-    found = np.zeros((n, n), np.bool_)
+    positions = (grid.coordinates()[2][0] / grid.voxel_size + (coarse - 1) / 2 + coarse * np.arange(n)) / coarse
+    inside_hull = np.zeros((n, n), np.bool_)
     for band in np.array_split(np.arange(material.shape[1]), min(_BANDS, material.shape[1])):
         shadow = material[:, band].any(axis=1)
         first = np.where(shadow, cols, cols.size).min(axis=1)
@@ -269,10 +269,10 @@ def _hull(material: Mask, geometry: Geometry, grid: Grid, coarse: int) -> Mask:
         high = np.where((last >= cols.size - 2) | unknown, np.inf, last + 1 - geometry.axis_col)
         within = np.zeros((n, n), np.int32)
         for angle, left, right in zip(geometry.angles.tolist(), low.tolist(), high.tolist(), strict=True):
-            across = np.cos(angle) * at[None, :] + np.sin(angle) * at[:, None]
+            across = np.cos(angle) * positions[None, :] + np.sin(angle) * positions[:, None]
             within += (across >= left) & (across <= right)
-        found |= within >= _WITHIN * len(low)
-    return found
+        inside_hull |= within >= _WITHIN * len(low)
+    return inside_hull
 
 
 def _extent(positions: NDArray[np.intp], coarse: int) -> Span:

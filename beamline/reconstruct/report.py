@@ -39,17 +39,17 @@ _NO_REFERENCE = (
 
 
 def compose(
-    made: MadeVolume, volumes: Mapping[str, Volume], checked: CheckedVolume, parameters: Mapping[str, Value]
+    outcome: MadeVolume, volumes: Mapping[str, Volume], checked: CheckedVolume, parameters: Mapping[str, Value]
 ) -> Report:
     """The report on a reconstruction."""
-    result, prepared, truth, context = made.result, made.prepared, made.truth, made.context
+    result, prepared, truth, context = outcome.result, outcome.prepared, outcome.truth, outcome.context
     metrics, judgement = checked.metrics, checked.judgement
     settings = {
         k: as_text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k not in ("command", "recipe")
-    } | {f"law: {name}": left for name, left in prepared.origin.laws.items()}
+    } | {f"law: {name}": residual for name, residual in prepared.origin.laws.items()}
     return Report(
         title=f"{context.facts.sample or context.facts.name}: {label_of(result.method)}",
-        summary=_summary(made, metrics),
+        summary=_summary(outcome, metrics),
         scan=context.facts.table,
         settings=settings,
         metrics={label_of(method): values for method, values in metrics.items()},
@@ -69,8 +69,8 @@ def compose(
     )
 
 
-def _summary(made: MadeVolume, metrics: Mapping[str, Mapping[str, float]]) -> str:
-    result, prepared, truth, context = made.result, made.prepared, made.truth, made.context
+def _summary(outcome: MadeVolume, metrics: Mapping[str, Mapping[str, float]]) -> str:
+    result, prepared, truth, context = outcome.result, outcome.prepared, outcome.truth, outcome.context
     name, geometry = label_of(result.method), prepared.geometry
     best = "psnr" if truth is not None else "residual"
     own = metrics[result.method]
@@ -213,17 +213,17 @@ def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mappin
 def _several(series: VolumeSeries) -> Iterator[Picture]:
     """Slices of some of the volumes of a time series, side by side."""
     n, depth = series.data.shape[:2]
-    some = spread(np.arange(n), _SHOWN)
+    shown_times = spread(np.arange(n), _SHOWN)
     for title, turned in (("Slices at each time", False), ("Vertical slices at each time", True)):
         if turned and depth < _UPRIGHT:
             continue
         sheet = SliceSheet("z" if turned else "y")
-        for k in some:
+        for k in shown_times:
             volume = series.data[k]
             sheet.add(series.labels[k], volume.swapaxes(0, 1) if turned else volume)
         yield Picture(
             title,
-            f"{len(some)} of {n} times, all with the same grey window: differences are changes or motion of the "
+            f"{len(shown_times)} of {n} times, all with the same grey window: differences are changes or motion of the "
             "sample.",
             sheet.png(sheet.labels()),
         )
@@ -251,7 +251,7 @@ def _doubts(
     if result.change is not None:
         moved = Volume(result.volume.data - result.change.data, result.volume.grid)
         check = unexplained_by(moved, prepared.views.seen, np.random.default_rng(0))
-        left = check.alone(moved, prepared.geometry)
+        unexplained_change = check.alone(moved, prepared.geometry)
         yield Picture(
             "Change since the reference",
             "A slice of the moved reference, of this volume, and of their difference. Red: denser than before, blue: "
@@ -259,7 +259,7 @@ def _doubts(
             "motion. The last picture is FBP of the residual (the measured projections minus those of the moved "
             "reference), blurred by a voxel and divided by its standard error. Beyond 4 and -4 the projections "
             "themselves show a change." + _displaced(result, moved),
-            pictures.change(result.volume, result.change, left, unit, kind),
+            pictures.change(result.volume, result.change, unexplained_change, unit, kind),
         )
     if result.deviation is not None:
         yield Picture(
@@ -270,13 +270,15 @@ def _doubts(
             pictures.error_bars(result.volume, result.deviation, unit, kind),
         )
     if unexplained is not None:
-        at = len(unexplained.significance) // 2
+        middle = len(unexplained.significance) // 2
         yield Picture(
             "Residual in the projections",
             "Filtered back-projection of the residual, divided by its noise. The picture should show even noise, "
             "with values seldom above 4 or below -4. An edge, crack or pore that is visible here is in the "
             "projections, but not in the volume. Blue: the volume is too dense, red: not dense enough.",
-            pictures.significance(unexplained.significance[at], result.volume.grid, unexplained.first + at, unit),
+            pictures.significance(
+                unexplained.significance[middle], result.volume.grid, unexplained.first + middle, unit
+            ),
         )
     if result.history:
         yield Picture(

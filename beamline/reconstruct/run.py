@@ -77,8 +77,8 @@ def without_outside(prepared: PreparedProjections, result: Reconstruction) -> Pr
         return prepared
     lines = prepared.lines
     for first in range(0, len(lines.data), _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
-        lines.data[some] -= result.outside(lines.geometry.select(some))
+        block = slice(first, first + _AT_ONCE)
+        lines.data[block] -= result.outside(lines.geometry.select(block))
     assert lines.reach is not None
     within = replace(lines.reach, sample=None, tall=False, measured=True)
     return replace(prepared, lines=replace(lines, reach=within))

@@ -56,8 +56,8 @@ def reasons(flags: FrameFlags) -> list[str]:
             worst = ""
             scored = rows[np.isfinite(flags.scores[rows, i])]
             if scored.size:
-                at = scored[np.argmax(np.abs(flags.scores[scored, i]))]
-                worst = f", worst {flags.scores[at, i]:.3g} {entry.unit} in frame {at}"
+                worst_row = scored[np.argmax(np.abs(flags.scores[scored, i]))]
+                worst = f", worst {flags.scores[worst_row, i]:.3g} {entry.unit} in frame {worst_row}"
             name = f"{str(level).capitalize()} ({entry.name})"
             lines.append(f"{name}: {frames_text(rows)}{worst}: {entry.meaning}.")
     return lines
@@ -90,8 +90,8 @@ def reference_images(source: ScanSource) -> dict[str, NDArray[np.float32]]:
             images[f"{title} (counts)"] = np.asarray(mean, np.float32)
     if len(images) == len(shown):
         dark, first, last = images.values()
-        lit = first - dark > 0.1 * np.median(first - dark)
-        images["last flats / first"] = np.where(lit, (last - dark) / np.where(lit, first - dark, 1), np.nan)
+        exposed = first - dark > 0.1 * np.median(first - dark)
+        images["last flats / first"] = np.where(exposed, (last - dark) / np.where(exposed, first - dark, 1), np.nan)
     return images
 
 
@@ -100,7 +100,7 @@ def _ranked(flags: FrameFlags, check: int, entry: FlagBit, level: Level) -> list
     rows = rows[np.argsort(-np.abs(flags.scores[rows, check]), kind="stable")]
     apart: list[int] = []
     for row in rows.tolist():
-        if all(abs(row - other) >= APART for other in apart):
+        if all(abs(row - shown_row) >= APART for shown_row in apart):
             apart.append(row)
     return apart[:MOST]
 

@@ -138,7 +138,7 @@ class _SlabJob:
         Raises:
             DataError: no slab contains material.
         """
-        for at, n in enumerate(numbers):
+        for place, n in enumerate(numbers):
             self.announce(n)
             decide = Decisions(self.options.seed)
             slab, _ = self.made(n, self.run, decide, 0, first=True)
@@ -146,10 +146,10 @@ class _SlabJob:
                 continue
             record = _record(self.prepared, self.options, self.grid, self.begin)
             made_from = _provenance(self.prepared, self.options)
-            path, kept = self.options.partial_path, _kept(slab, decide)
-            partial = create_partial(path, record, self.slabs, made_from, kept)
+            path, decisions = self.options.partial_path, _kept(slab, decide)
+            partial = create_partial(path, record, self.slabs, made_from, decisions)
             partial.add(n, slab.volume.data)
-            return partial, list(numbers[at + 1 :])
+            return partial, list(numbers[place + 1 :])
         raise DataError("There is no sample in the beam: the projections are zero everywhere.")
 
     def made(
@@ -233,9 +233,9 @@ def _provenance(prepared: PreparedProjections, options: ReconOptions) -> dict[st
         rows = prepared.geometry.detector_shape[0]
         for first in range(0, rows, _WEIGHED):
             end = min(first + _WEIGHED, rows)
-            some = prepared.of_rows(slice(first, end), prepared.geometry.rows(first, end)).views.seen.weights
-            if some is not None:
-                weights.update(np.ascontiguousarray(some[...]).data)
+            weights_of_rows = prepared.of_rows(slice(first, end), prepared.geometry.rows(first, end)).views.seen.weights
+            if weights_of_rows is not None:
+                weights.update(np.ascontiguousarray(weights_of_rows[...]).data)
     others: dict[str, Value] = {
         "method": options.method.name, "seed": options.seed, "device": options.device, "program": version(),
     }  # fmt: skip
@@ -269,11 +269,12 @@ def _kept(first: Reconstruction, decide: Decisions) -> dict[str, Any]:
 
 def _finished(partial: PartialVolume, grid: Grid, options: ReconOptions, seconds: float) -> Reconstruction:
     """The result, after all slabs are finished."""
-    kept = partial.kept
-    settings = {**kept["settings"], "slabs": len(partial.slabs), "slab_halo": options.method.halo}
-    history = tuple(Progress(*values) for values in kept["history"])
+    stored = partial.kept
+    settings = {**stored["settings"], "slabs": len(partial.slabs), "slab_halo": options.method.halo}
+    history = tuple(Progress(*values) for values in stored["history"])
     return Reconstruction(
-        Volume(partial.volume, grid), settings, history, method=kept["method"], seconds=seconds, chosen=kept["chosen"],
+        Volume(partial.volume, grid), settings, history, method=stored["method"], seconds=seconds,
+        chosen=stored["chosen"],
         ending=Ending(resumed_from="" if options.partial is None else str(options.partial)),
     )  # fmt: skip
 
@@ -281,8 +282,11 @@ def _finished(partial: PartialVolume, grid: Grid, options: ReconOptions, seconds
 def busiest_first(prepared: PreparedProjections, grid: Grid, slabs: Sequence[Slab]) -> list[int]:
     """The numbers of the slabs. The first number is that of the slab whose rows show the most material."""
     data = prepared.seen.data
-    some, rows = data[:: max(1, len(data) // _LOOKED_AT)], [part_of(prepared.geometry, grid, s.own)[0] for s in slabs]
-    absorption = [sum(float(np.abs(view[part]).sum(dtype=np.float64)) for view in some) for part in rows]
+    sampled, rows = (
+        data[:: max(1, len(data) // _LOOKED_AT)],
+        [part_of(prepared.geometry, grid, s.own)[0] for s in slabs],
+    )
+    absorption = [sum(float(np.abs(view[part]).sum(dtype=np.float64)) for view in sampled) for part in rows]
     best = int(np.argmax(absorption))
     return [best, *(n for n in range(len(slabs)) if n != best)]
 
@@ -300,8 +304,8 @@ def _of_all(control: RunControl, begin: float, done: int, slab: Slab, slices: in
         share = (
             0.0 if progress.unit.startswith(SWEEPS_OF_TRIALS) or not progress.steps else progress.step / progress.steps
         )
-        at = done + round((slab.own.stop - slab.own.start) * share)
-        reached = max(reached, at)  # the voxel refinement after a fit counts from its own beginning
+        steps = done + round((slab.own.stop - slab.own.start) * share)
+        reached = max(reached, steps)  # the voxel refinement after a fit counts from its own beginning
         listen(replace(progress, step=reached, steps=slices, seconds=control.now() - begin, unit="slices"))
 
     return watch

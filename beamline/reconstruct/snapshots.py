@@ -50,7 +50,7 @@ class Snapshots:
         self.drawn = False  # True if the picture is of this scan
         self._slices: tuple[PictureRow, ...] = ()  # last drawn rows of the picture: FBP slices, and the volume
         self._grown: tuple[PictureRow, ...] = ()
-        self._at: Sequence[float] | None = None  # z, y and x of the FBP slices, at which the volume is also shown
+        self._centre: Sequence[float] | None = None  # z, y and x of the FBP slices, at which the volume is also shown
         self._unseen: Wedge | None = None  # missing wedge of the projections of these slices
         self.unit = "mm" if source.pixel_size_mm or options.selection.pixel_size_mm else "px"
 
@@ -98,8 +98,8 @@ class Snapshots:
         """Write the picture: these FBP slices, and below them the rows `below`, or the last drawn slices of the volume
         if there are any.
         """
-        self._at, self._unseen = slices.at, unseen
-        panels = slice_panels(slices.images, slices.at, slices.pixel, self.unit, unseen)
+        self._centre, self._unseen = slices.centre, unseen
+        panels = slice_panels(slices.images, slices.centre, slices.pixel, self.unit, unseen)
         self._slices = (PictureRow(heading, panels), *([] if below is None else [below]))
         try:
             self._write_picture()
@@ -117,8 +117,8 @@ class Snapshots:
         """The method of the volume that is shown. If two methods were compared, also their errors in held-out
         projections.
         """
-        fit, found = self._options.streaming.name, shown.errors
-        errors = {fit: found.fit, Fbp.name: found.direct} if math.isfinite(found.direct) else {}
+        fit, shown_errors = self._options.streaming.name, shown.errors
+        errors = {fit: shown_errors.fit, Fbp.name: shown_errors.direct} if math.isfinite(shown_errors.direct) else {}
         return Fbp.name if shown.direct else fit, errors
 
     def _rows(self, fit: StreamingFit, volume: Volume, shown: str) -> tuple[PictureRow, ...]:
@@ -126,7 +126,7 @@ class Snapshots:
             f"{fit.n_views} projections so far, {shown}; {fit.progress().n_gaussians} Gaussians, "
             f"{self._clock.now() - self._begin:.0f} s after the start"
         )
-        return volume_rows(volume, *fit.newest_view(), heading, self.unit, (self._at, self._unseen))
+        return volume_rows(volume, *fit.newest_view(), heading, self.unit, (self._centre, self._unseen))
 
     def _write_picture(self) -> None:
         write_whole(self.picture_path, live_picture((*self._slices, *self._grown)), replace=True)
@@ -161,14 +161,14 @@ class LiveSlices:
         # the last view that was drawn; the time from which slices may be drawn again
         self._newest, self._next = -1, -math.inf
 
-    def draw(self, parts: Sequence[Projections], axis_col: float | None, pause: float | None, of: int = 0) -> None:
+    def draw(self, parts: Sequence[Projections], axis_col: float | None, pause: float | None, total: int = 0) -> None:
         """Draw slices from corrected projections. `axis_col` is the rotation axis as a column of the file; None: the
         middle of the detector is used as axis. No slices are drawn for a cone beam, or if the projections have a roll,
         a tilt or shifts.
 
         Args:
             pause: shortest time in s until slices are drawn again; None: draw now.
-            of: number of projections so far; 0 if `parts` contains all of them.
+            total: number of projections so far; 0 if `parts` contains all of them.
         """
         n, begin = sum(part.view_ids.size for part in parts), self._clock.now()
         if n < FEWEST or (pause is not None and begin < self._next) or int(parts[-1].view_ids[-1]) == self._newest:
@@ -179,7 +179,7 @@ class LiveSlices:
         with suppress(ValueError):
             data = [view for part in parts for view in part.data]
             slices = orthogonal_slices(data, geometry)
-            count = f"{n} of {of}" if of > n else str(n)
+            count = f"{n} of {total}" if total > n else str(n)
             place = (
                 "the detector middle, because the axis is not known yet: expect crescents (set optics.axis_col or "
                 "--axis)"

@@ -53,13 +53,13 @@ class CheckedVolume:
     skipped_text: str = ""
 
 
-def check_volume(made: MadeVolume, sink: Sink, clock: Clock) -> CheckedVolume:
+def check_volume(outcome: MadeVolume, sink: Sink, clock: Clock) -> CheckedVolume:
     """Compare a volume with its projections and with FBP, and send each warning to `sink`.
 
     Checks are left out if they would take longer than the time limit in `context` allows, or if the reconstruction was
     stopped. The result then has a remark.
     """
-    result, prepared, truth, context = made.result, made.prepared, made.truth, made.context
+    result, prepared, truth, context = outcome.result, outcome.prepared, outcome.truth, outcome.context
     volumes, warnings = {result.method: result.volume}, list(context.warnings)
 
     def tell(*sentences: str) -> None:
@@ -71,7 +71,7 @@ def check_volume(made: MadeVolume, sink: Sink, clock: Clock) -> CheckedVolume:
         figures = {"residual": result.series.residual, "seconds": result.seconds}
         return CheckedVolume(Judgement(figures), volumes, {result.method: figures}, warnings)
     tell(_sample_radius(result, prepared), _unused_levels(result))
-    aspects, fitted = _aspects(made), by_name(result.method).fitted
+    aspects, fitted = _aspects(outcome), by_name(result.method).fitted
     time = TimeLeft(clock.now, lambda seconds: not result.ending.early and context.leaves(seconds))
     progress = context.phases.progress
     judgement = judge(
@@ -81,12 +81,12 @@ def check_volume(made: MadeVolume, sink: Sink, clock: Clock) -> CheckedVolume:
     metrics: dict[str, dict[str, float]] = {result.method: {**judgement.figures, "seconds": result.seconds}}
     hiding = _structure(result, judgement)
     tell(not_begun_warning(result, judgement), hiding, _stray_mass(result, judgement) if fitted else "")
-    tell(_needles(result, prepared), odd_views_warning(judgement.odd_views, made))
+    tell(_needles(result, prepared), odd_views_warning(judgement.odd_views, outcome))
     skipped = list(judgement.skipped)
-    if fitted and made.target.report is not None and has_direct_method(prepared.geometry):
+    if fitted and outcome.target.report is not None and has_direct_method(prepared.geometry):
         if time.leaves(_FBP_WORK * judgement.seconds_of_views):
             before = clock.now()
-            fbp = _fbp(made)
+            fbp = _fbp(outcome)
             seconds, residual = clock.now() - before, aspects & Aspect.RESIDUAL
             of_fbp = judge(fbp, prepared.views, truth, aspects=residual, progress=progress).figures
             volumes = {BASELINE: fbp, **volumes}
@@ -104,14 +104,14 @@ def check_volume(made: MadeVolume, sink: Sink, clock: Clock) -> CheckedVolume:
     return CheckedVolume(judgement, volumes, metrics, warnings, hiding, text if skipped else "")
 
 
-def _aspects(made: MadeVolume) -> Aspect:
+def _aspects(outcome: MadeVolume) -> Aspect:
     """The checks that can be made for this volume. No residual is computed if the projections show more than the
     volume. This is so if the volume is only a region, or if the sample is larger than the field of view and the part
     outside was not subtracted. The residual of a direct method contains the blur of its filter.
     """
-    result, prepared = made.result, made.prepared
+    result, prepared = outcome.result, outcome.prepared
     geometry, fitted, reach = prepared.geometry, by_name(result.method).fitted, prepared.lines.reach
-    if made.context.region is not None and result.volume.grid.shape != Grid.matching(geometry).shape:
+    if outcome.context.region is not None and result.volume.grid.shape != Grid.matching(geometry).shape:
         show_more = True
     elif fitted:
         subtracted = reach is not None and reach.measured and reach.sample is None
@@ -199,13 +199,13 @@ def _needles(result: Reconstruction, prepared: PreparedProjections) -> str:
     )
 
 
-def odd_views_warning(odd: Sequence[OddView], made: MadeVolume) -> str:
+def odd_views_warning(odd: Sequence[OddView], outcome: MadeVolume) -> str:
     """The warning about projections that do not fit the volume, with frames and pixels of the worst ones; empty if all
     projections fit.
     """
     if not odd:
         return ""
-    frames, selection = made.prepared.ids, made.context.selection
+    frames, selection = outcome.prepared.ids, outcome.context.selection
     binning, first_row = selection.binning, (selection.rows or (0, 0))[0]
     places = [
         f"frame {frames[each.view]}, rows {first_row + each.rows[0] * binning} ... "
@@ -221,12 +221,12 @@ def odd_views_warning(odd: Sequence[OddView], made: MadeVolume) -> str:
     )
 
 
-def _fbp(made: MadeVolume) -> Volume:
+def _fbp(outcome: MadeVolume) -> Volume:
     """FBP of the same projections."""
-    result, prepared, context = made.result, made.prepared, made.context
+    result, prepared, context = outcome.result, outcome.prepared, outcome.context
     context.phases.enter("FBP for comparison", "slices")
     grid, on_disk = result.volume.grid, isinstance(result.volume.data, np.memmap)
-    out = scratch_array(made.target.output.parent, grid.shape) if on_disk else None
+    out = scratch_array(outcome.target.output.parent, grid.shape) if on_disk else None
     lines, progress = prepared.seen.data, context.phases.progress
     volume = direct(lines, prepared.geometry, grid, context.filter, progress, out)
     if (gain := density_gain(prepared.geometry)) != 1:
@@ -256,15 +256,15 @@ def _beside_each_other(
 
 def _lost_material(result: Reconstruction, prepared: PreparedProjections, fbp: Volume) -> str:
     """The warning that weakly absorbing material is missing in the volume, although FBP shows it."""
-    lit, seen = prepared.sources.measured, None  # seen [z]: the detector row of the slice was in the beam
-    if lit is not None and prepared.geometry.rows_show_slices and fbp.grid.shape[0] == len(lit):
-        seen = np.asarray(lit.any(axis=1))
-    if (lost := lost_matter(result.volume.data, fbp.data, seen)) is None:
+    measured, rows_in_beam = prepared.sources.measured, None  # [z]: the detector row of the slice was in the beam
+    if measured is not None and prepared.geometry.rows_show_slices and fbp.grid.shape[0] == len(measured):
+        rows_in_beam = np.asarray(measured.any(axis=1))
+    if (lost := lost_matter(result.volume.data, fbp.data, rows_in_beam)) is None:
         return ""
     z, y, x = (f"{first}:{end}" for first, end in lost.region)
     return (
         f"Weakly absorbing material is missing: in the region {z},{y},{x} [z, y, x] the {label_of(result.method)} "
-        f"volume has only {lost.kept:.0%} of the mass that FBP shows (measured from the air level of FBP). This "
+        f"volume has only {lost.kept_share:.0%} of the mass that FBP shows (measured from the air level of FBP). This "
         "happens, for example, if the air level is below zero. Use --allow-negative or --method fbp, or correct the "
         "air (--air, see docs/corrections.md)."
     )

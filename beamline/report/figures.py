@@ -74,8 +74,8 @@ Plane = tuple[str, str, tuple[float, float, float, float]]
 
 def planes(grid: Grid, unit: str) -> list[Plane]:
     """The planes of the slices across z, y and x."""
-    ends = [(at - n / 2 * grid.voxel_size, at + n / 2 * grid.voxel_size)
-            for at, n in zip(grid.centre, grid.shape, strict=True)]  # fmt: skip
+    ends = [(middle - n / 2 * grid.voxel_size, middle + n / 2 * grid.voxel_size)
+            for middle, n in zip(grid.centre, grid.shape, strict=True)]  # fmt: skip
     return [
         (f"{'zyx'[across]} ({unit})", downwards("zyx"[down], unit), (*ends[across], *ends[down][::-1]))
         for down, across in ((1, 2), (0, 2), (0, 1))
@@ -128,7 +128,7 @@ def bright_centre(data: NDArray[np.float32]) -> tuple[int, int, int]:
     if total == 0:
         return data.shape[0] // 2, data.shape[1] // 2, data.shape[2] // 2
     centre = (step * float(m @ np.arange(m.size)) / total for step, m in zip(steps, marginals, strict=True))
-    return tuple(round(at) for at in centre)
+    return tuple(round(index) for index in centre)
 
 
 def dpi_for(voxels: int, inches: float) -> float:
@@ -166,8 +166,8 @@ def panels(
     lefts = [left + sum(across[:j]) + gap * j for j in range(len(across))]
     bottoms = [height - _TOP - sum(down[: i + 1]) - _BELOW * i for i in range(len(down))]
     return figure, [
-        [figure.add_axes((at / width, bottom / height, wide / width, high / height))
-         for at, wide in zip(lefts, across, strict=True)]
+        [figure.add_axes((left_edge / width, bottom / height, wide / width, high / height))
+         for left_edge, wide in zip(lefts, across, strict=True)]
         for bottom, high in zip(bottoms, down, strict=True)
     ]  # fmt: skip
 

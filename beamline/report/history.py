@@ -98,8 +98,8 @@ def quality_against_time(
     ]
     curve = residual_curve(history)
     figure = new_figure((WIDTH, 3.1))
-    left, *others = np.ravel(figure.subplots(1, 1 + (curve is not None) + bool(growing)))
-    _misfit(left, history)
+    misfit_axes, *others = np.ravel(figure.subplots(1, 1 + (curve is not None) + bool(growing)))
+    _misfit(misfit_axes, history)
     if curve is not None:
         axes = others.pop(0)
         axes.plot(*curve.decibels, color="tab:green", lw=1.2, marker=".", ms=3)

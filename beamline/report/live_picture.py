@@ -97,18 +97,22 @@ def volume_rows(
         z, y, x = np.multiply((k, j, i), bright_centre(data[::k, ::j, ::i])).tolist()
     else:
         z, y, x = (int(np.abs(axis - to).argmin()) for axis, to in zip(grid.coordinates(), place, strict=True))
-    at = [axis[i] for axis, i in zip(grid.coordinates(), (z, y, x), strict=True)]
-    panels = slice_panels((data[z], data[:, y], data[:, :, x]), at, grid.voxel_size, unit, unseen)
+    positions = [axis[i] for axis, i in zip(grid.coordinates(), (z, y, x), strict=True)]
+    panels = slice_panels((data[z], data[:, y], data[:, :, x]), positions, grid.voxel_size, unit, unseen)
     return PictureRow(heading, panels), PictureRow("", _view_panels(view, render))
 
 
 def slice_panels(
-    images: Sequence[F32], at: Sequence[float], pixel: float, unit: str, unseen: Wedge | None = None
+    images: Sequence[F32], positions: Sequence[float], pixel: float, unit: str, unseen: Wedge | None = None
 ) -> list[_Panel]:
     """Slices across z, y and x at these places, in the same greys."""
     window = material_window(*images)
     grey = f"{window[0]:.3g} to {window[1]:.3g} 1/{unit}"
-    labels = f"x → y ↓ at z = {at[0]:.3g} {unit}", f"x → z ↓ at y = {at[1]:.3g}", f"y → z ↓ at x = {at[2]:.3g}"
+    labels = (
+        f"x → y ↓ at z = {positions[0]:.3g} {unit}",
+        f"x → z ↓ at y = {positions[1]:.3g}",
+        f"y → z ↓ at x = {positions[2]:.3g}",
+    )
     notes = (grey, "the same greys and scale", "the same greys and scale")
     pixels, zoom = _sized(images)
     bar = pixel / zoom, unit
@@ -125,8 +129,8 @@ def reference_row(shown: Preview, n_views: int, unit: str) -> PictureRow:
     Args:
         n_views: number of projections so far.
     """
-    at, grid = len(shown.volume.data) // 2, shown.volume.grid
-    moved, volume = shown.moved.data[at], shown.volume.data[at]
+    middle, grid = len(shown.volume.data) // 2, shown.volume.grid
+    moved, volume = shown.moved.data[middle], shown.volume.data[middle]
     change = volume - moved
     window, reach = material_window(moved, volume), float(np.percentile(np.abs(change), _MOST)) or 1.0
     (moved, volume, change), zoom = _sized((moved, volume, change))

@@ -100,14 +100,14 @@ def orthogonal_slices(
     """
     first = next(iter(volumes.values())).grid
     nz, ny, nx = first.shape
-    at = bright_centre(list(volumes.values())[-1].data)
-    greys = material_window(*(image for volume in volumes.values() for image in _orthogonal_cuts(volume, at)))
+    centre = bright_centre(list(volumes.values())[-1].data)
+    greys = material_window(*(image for volume in volumes.values() for image in _orthogonal_cuts(volume, centre)))
     height = max(ny / nx, nz / nx, nz / ny, THIN)
     column = min((WIDTH - _BESIDE - BAR - 2 * _BESIDE) / 3, 12 / (height * len(volumes)))
     down = [column * height] * len(volumes)
     figure, rows = panels([column] * 3, down, dpi_for(nx, column), left=_BESIDE, gap=_BESIDE, right=BAR)
     for row, (name, volume) in zip(rows, volumes.items(), strict=True):
-        shown = _draw_cuts(row, volume, at, unit, name, greys, "gray")
+        shown = _draw_cuts(row, volume, centre, unit, name, greys, "gray")
     add_bar(figure, shown, kind.label(unit), size=7)
     return png(figure)
 
@@ -118,12 +118,12 @@ def _orthogonal_cuts(volume: Volume, centre: Sequence[int]) -> list[NDArray[np.f
 
 
 def _draw_cuts(
-    row: Sequence[Axes], volume: Volume, at: Sequence[int], unit: str, name: str, window: GreyWindow, colours: str
+    row: Sequence[Axes], volume: Volume, centre: Sequence[int], unit: str, name: str, window: GreyWindow, colours: str
 ) -> AxesImage:
     """Draw the orthogonal slices through a voxel side by side. The first slice has the name as its heading."""
-    centres, cuts = volume.grid.coordinates(), _orthogonal_cuts(volume, at)
+    centres, cuts = volume.grid.coordinates(), _orthogonal_cuts(volume, centre)
     for i, (axes, image, plane) in enumerate(zip(row, cuts, planes(volume.grid, unit), strict=True)):
-        place = f"{'zyx'[i]} = {centres[i][at[i]]:.3g} {unit}"
+        place = f"{'zyx'[i]} = {centres[i][centre[i]]:.3g} {unit}"
         shown = draw_slice(axes, image, plane, f"{name}, {place}" if name and i == 0 else place, window, colours, 7)
     return shown
 
@@ -159,22 +159,22 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind
     y, x = np.unravel_index(int(np.argmax(np.hypot(down, across))), down.shape)
     angle = math.atan2(down[y, x], across[y, x])
     t = np.arange(-_PROFILE, _PROFILE + 0.25, 0.5)
-    figure, ((left, right),) = panels([3.27, 3.27], [2.35], gap=LEFT)
+    figure, ((profile_axes, right),) = panels([3.27, 3.27], [2.35], gap=LEFT)
     for name, volume in volumes.items():
-        at = (y + t * math.sin(angle), x + t * math.cos(angle))
-        line = ndimage.map_coordinates(volume.data[z], at, order=1, mode="constant", cval=np.nan)
-        left.plot(t * volume.grid.voxel_size, line, lw=1.2, label=name)
+        points = (y + t * math.sin(angle), x + t * math.cos(angle))
+        line = ndimage.map_coordinates(volume.data[z], points, order=1, mode="constant", cval=np.nan)
+        profile_axes.plot(t * volume.grid.voxel_size, line, lw=1.2, label=name)
         few = volume.data[tuple(slice(None, None, max(1, n // LOOKED_AT)) for n in volume.data.shape)]
         low, high = grey_window([few], 0.05, 99.95)
         count, edges = np.histogram(few, bins=120, range=(low, high))
         right.stairs(count / few.size, edges, lw=1.2, label=name)
-    left.xaxis.set_major_locator(MaxNLocator(5))
+    profile_axes.xaxis.set_major_locator(MaxNLocator(5))
     right.set_yscale("log")
     right.yaxis.set_major_formatter("{x:g}")  # powers drawn as formulas take as long as all of the rest
     # choosing which ticks of a decade to label takes long, so none is labelled
     right.yaxis.set_minor_formatter(NullFormatter())
     edge = f"Edge at y = {y}, x = {x} of slice {z} (voxels)"
-    finish(left, f"along the line ({unit})", kind.label(unit), edge, 9, grid=True)
+    finish(profile_axes, f"along the line ({unit})", kind.label(unit), edge, 9, grid=True)
     finish(right, kind.label(unit), "share of voxels", "Values", 9, grid=True)
     return png(figure)
 
@@ -205,9 +205,9 @@ def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
     """A slice through the bright voxels. Sectors about the axis show the directions of missing rays."""
     from matplotlib.patches import Wedge as Sector
 
-    at, grid = bright_centre(volume.data)[0], volume.grid
+    middle, grid = bright_centre(volume.data)[0], volume.grid
     figure, axes = one_panel(5.4, 6.4)
-    image, title = volume.data[at], f"Rays that no projection has, slice {at}"
+    image, title = volume.data[middle], f"Rays that no projection has, slice {middle}"
     draw_slice(axes, image, planes(grid, unit)[0], title, material_window(image))
     radius = 0.48 * grid.shape[2] * grid.voxel_size
     for wedge in unseen:
@@ -221,15 +221,15 @@ def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
 
 def error_bars(volume: Volume, deviation: Volume, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
     """A slice through the bright voxels, and its standard deviation, each with its colour bar and a scale bar."""
-    at, grid = bright_centre(volume.data)[0], volume.grid
+    middle, grid = bright_centre(volume.data)[0], volume.grid
     figure = new_figure((WIDTH, 4.4), dpi_for(grid.shape[2], WIDTH / 2.4))
     length = round_length(grid.shape[2] * grid.voxel_size / 5)
     panels = (
-        (volume.data[at], kind.value, "gray", material_window(volume.data[at])),
-        (deviation.data[at], "standard deviation", "magma", grey_window([deviation.data[at]], 0.5, 99.5)),
+        (volume.data[middle], kind.value, "gray", material_window(volume.data[middle])),
+        (deviation.data[middle], "standard deviation", "magma", grey_window([deviation.data[middle]], 0.5, 99.5)),
     )
     for axes, (image, label, colours, window) in zip(figure.subplots(1, 2), panels, strict=True):
-        drawn = draw_slice(axes, image, planes(grid, unit)[0], f"Slice {at}", window, colours)
+        drawn = draw_slice(axes, image, planes(grid, unit)[0], f"Slice {middle}", window, colours)
         left, _, _, top = drawn.get_extent()
         across, down = [left + length / 4, left + 5 * length / 4], top + length / 4
         axes.plot(across, [down, down], color="white", lw=3, solid_capstyle="butt")
@@ -239,27 +239,41 @@ def error_bars(volume: Volume, deviation: Volume, unit: str, kind: VoxelKind = V
 
 
 def change(
-    volume: Volume, change: Volume, left: Unexplained | None, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION
+    volume: Volume, change: Volume, unexplained: Unexplained | None, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION
 ) -> bytes:
     """The slice with the largest change: the reference, the volume, the volume minus the reference, and the change in
     the projections divided by its standard error.
 
     Args:
-        left: what the moved reference leaves of the projections, of some slices; None: not known.
+        unexplained: what the moved reference leaves of the projections, of some slices; None: not known.
     """
-    looked = slice(None) if left is None else slice(left.first, left.first + len(left.significance))
+    looked = (
+        slice(None)
+        if unexplained is None
+        else slice(unexplained.first, unexplained.first + len(unexplained.significance))
+    )
     first = looked.start or 0
-    at, grid = first + int(np.argmax([np.square(part).sum() for part in change.data[looked]])), volume.grid
-    window, most = material_window(volume.data[at]), float(np.percentile(np.abs(change.data[at]), 99.5)) or 1.0
-    down, across = (1, 3) if left is None else (2, 2)
+    slice_number, grid = first + int(np.argmax([np.square(part).sum() for part in change.data[looked]])), volume.grid
+    window, most = (
+        material_window(volume.data[slice_number]),
+        float(np.percentile(np.abs(change.data[slice_number]), 99.5)) or 1.0,
+    )
+    down, across = (1, 3) if unexplained is None else (2, 2)
     figure = new_figure((WIDTH, 3.4 * down), dpi_for(grid.shape[2], WIDTH / 1.3 / across))
     panels = [
-        (volume.data[at] - change.data[at], f"Moved reference, slice {at}", window, "gray"),
-        (volume.data[at], f"Volume, slice {at}", window, "gray"),
-        (change.data[at], f"Change ({kind.unit(unit)})", (-most, most), "RdBu_r"),
+        (
+            volume.data[slice_number] - change.data[slice_number],
+            f"Moved reference, slice {slice_number}",
+            window,
+            "gray",
+        ),
+        (volume.data[slice_number], f"Volume, slice {slice_number}", window, "gray"),
+        (change.data[slice_number], f"Change ({kind.unit(unit)})", (-most, most), "RdBu_r"),
     ]
-    if left is not None:
-        panels.append((left.significance[at - first], "Change / standard error", (-8.0, 8.0), "RdBu_r"))
+    if unexplained is not None:
+        panels.append(
+            (unexplained.significance[slice_number - first], "Change / standard error", (-8.0, 8.0), "RdBu_r")
+        )
     for axes, (image, title, limits, colours) in zip(figure.subplots(down, across).flat, panels, strict=True):
         drawn = draw_slice(axes, image, planes(grid, unit)[0], title, limits, colours, 8)
         figure.colorbar(drawn, ax=axes, shrink=0.8)

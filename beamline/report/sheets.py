@@ -112,8 +112,8 @@ def _differ_most(images: Sequence[F32]) -> tuple[slice, slice]:
     sums = ndimage.uniform_filter(np.ptp(np.stack(images), axis=0), size, mode="constant")
     # number of squares in the image
     whole = [slice(n // 2, side - (n - 1) // 2) for n, side in zip(size, shape, strict=True)]
-    at = np.unravel_index(int(np.argmax(sums[tuple(whole)])), sums[tuple(whole)].shape)
-    rows, cols = (slice(int(first), int(first) + n) for first, n in zip(at, size, strict=True))
+    place = np.unravel_index(int(np.argmax(sums[tuple(whole)])), sums[tuple(whole)].shape)
+    rows, cols = (slice(int(first), int(first) + n) for first, n in zip(place, size, strict=True))
     return rows, cols
 
 

@@ -55,7 +55,7 @@ class TrialScan(Protocol):
     def asked_by(self, trial: MethodTrial) -> TrialRun:
         """The work of a trial. Raises ValueError if a setting or the projections do not exist."""
 
-    def measured(self, trial: MethodTrial, made: Volume) -> tuple[Mapping[str, float], Sequence[float]]:
+    def measured(self, trial: MethodTrial, volume: Volume) -> tuple[Mapping[str, float], Sequence[float]]:
         """Figures of merit of a volume by name, and the squared residual in each held-out projection."""
 
     def concluded(self, table: TrialTable) -> TrialTable:
@@ -96,17 +96,17 @@ class TrialData(TrialScan):
             views = averaged(self.views, trial.choice)
         return TrialRun(trial.build(), views, Grid.matching(self.geometry), self.seed)
 
-    def measured(self, trial: MethodTrial, made: Volume) -> tuple[dict[str, float], list[float]]:
+    def measured(self, trial: MethodTrial, volume: Volume) -> tuple[dict[str, float], list[float]]:
         """Figures of merit of a volume, and the squared residual of each held-out projection."""
-        truth = None if self.truth is None else Volume(self.truth, made.grid)
-        judged = judge(made, self.views, truth)
+        truth = None if self.truth is None else Volume(self.truth, volume.grid)
+        judged = judge(volume, self.views, truth)
         figures = {name: value for name, value in judged.figures.items() if name in _JUDGED}
         if (reference := self.references.get(trial.method)) is not None:
-            figures["psnr_all"] = metrics.psnr(reference, made.data)
-            figures["ssim_all"] = metrics.ssim3d(reference, made.data)
+            figures["psnr_all"] = metrics.psnr(reference, volume.data)
+            figures["ssim_all"] = metrics.ssim3d(reference, volume.data)
         if self.regions is not None:
-            figures |= contrast_in(self.regions, made)
-        return figures, [] if judged.held_out is None else judged.held_out.left.tolist()
+            figures |= contrast_in(self.regions, volume)
+        return figures, [] if judged.held_out is None else judged.held_out.squares.tolist()
 
 
 def averaged(views: Views, choice: ViewChoice) -> Views:
@@ -158,7 +158,7 @@ def run_trial(
         peak,
         {name: float(value) for name, value in figures.items()},
         None if result.gaussians is None else result.gaussians.n,
-        "; ".join(dict.fromkeys(str(one.message) for one in warned)),
+        "; ".join(dict.fromkeys(str(warning.message) for warning in warned)),
         cpu_seconds,
         squared,
     ), result.volume.data

@@ -93,8 +93,8 @@ class UnseenViews(NamedTuple):
 
     def of(self, ids: I64) -> UnseenViews:
         """The projections with these rows of the file."""
-        at = np.searchsorted(self.ids, ids)
-        return UnseenViews(ids, self.data[at], self.model[at], self.resolution.select(at), self.views)
+        places = np.searchsorted(self.ids, ids)
+        return UnseenViews(ids, self.data[places], self.model[places], self.resolution.select(places), self.views)
 
 
 def sliced(trials: Sequence[ReconOptions]) -> list[ReconOptions]:
@@ -145,18 +145,18 @@ class SweptScan(TrialScan):
     def asked_by(self, trial: MethodTrial) -> TrialRun:
         """The work of a trial. Raises ConfigError and DataError as `beamline recon` does."""
         assert isinstance(trial, SweptTrial)
-        options, asked = trial.options, trial.options.selection
+        options, own_selection = trial.options, trial.options.selection
         views = self._corrected(options)
-        self._used = views if asked.axis_col is None or not self._of_axes else _about(views, asked)
+        self._used = views if own_selection.axis_col is None or not self._of_axes else _about(views, own_selection)
         geometry = self._used.seen.geometry
         compile_kernels(options, geometry, self._sink, self._clock)
         method, grid = options.method_for(geometry), Grid.matching(views.seen.geometry)
         return TrialRun(method, self._used, grid, options.seed, options.device)
 
     def _corrected(self, options: ReconOptions) -> Views:
-        asked, source_words = options.selection, repr(options.source)
-        its_own = not self._of_axes and (asked.axis_col is not None or source_words != self._first)
-        wanted = asked if its_own else replace(asked, axis_col=self._axis)
+        own_selection, source_words = options.selection, repr(options.source)
+        its_own = not self._of_axes and (own_selection.axis_col is not None or source_words != self._first)
+        wanted = own_selection if its_own else replace(own_selection, axis_col=self._axis)
         if self._views is None or self._views[:2] != (source_words, wanted):
             with options.source.open() as source:
                 prepared = prepare_projections(select(source, wanted), Warnings(self._sink, self._clock))
@@ -167,22 +167,22 @@ class SweptScan(TrialScan):
             self._views = source_words, wanted, views
         return self._views[2]
 
-    def measured(self, trial: MethodTrial, made: Volume) -> tuple[Mapping[str, float], Sequence[float]]:
+    def measured(self, trial: MethodTrial, volume: Volume) -> tuple[Mapping[str, float], Sequence[float]]:
         """The residual in the held-out projections after the corrections of this trial, and its square in each
         projection."""
         used = self._used
         assert used is not None and self._views is not None
         apart = used.unseen
         assert apart is not None and apart.ids is not None
-        projector, data = Projector(apart.geometry, made.grid), apart.data
+        projector, data = Projector(apart.geometry, volume.grid), apart.data
         data = data if apart.weights is None else np.where(apart.weights[...] > 0, data, np.float32(np.nan))
-        model = projector.forward(np.asarray(made.data))
+        model = projector.forward(np.asarray(volume.data))
         unseen = UnseenViews(
             apart.ids, projection_lines(data), projection_lines(model), projector.resolution, self._views[2]
         )
         self.unseen[trial.label] = unseen
         squares = squares_left(unseen.model, unseen.data, None, unseen.resolution)
-        return {HELD_OUT: squares.residual}, squares.left.tolist()
+        return {HELD_OUT: squares.residual}, squares.squares.tolist()
 
     def concluded(self, table: TrialTable) -> TrialTable:
         """The table in which scores replace the residuals of the trials in their own projections, with verdicts and
@@ -201,11 +201,11 @@ class SweptScan(TrialScan):
         judged = {each.name: (share, verdict) for each, share, verdict in zip(
             choice.predictions, shares_of(choice), choice.verdicts, strict=True
         )}  # fmt: skip
-        for at in table.todo:
-            if (label := table.outcomes[at].trial.label) in judged:
+        for row in table.todo:
+            if (label := table.outcomes[row].trial.label) in judged:
                 share, verdict = judged[label]
                 metrics = {HELD_OUT: share}
-                table = table.with_outcome(at, replace(table.outcomes[at], verdict=verdict, metrics=metrics))
+                table = table.with_outcome(row, replace(table.outcomes[row], verdict=verdict, metrics=metrics))
         notes = [
             f"Use -m fista-tv to distinguish the values better: with {BASELINE} the residual is mostly the blur "
             "of its filter."
@@ -263,17 +263,17 @@ def scores_of(slices: Mapping[str, UnseenViews], *, direct: bool = False) -> tup
         return None
     same = all(np.array_equal(judge.data, unseen[0].data, equal_nan=True) for judge in judges)
     sums = [[squares_left(each.model, judge.data, None, judge.resolution) for judge in judges] for each in unseen]
-    scale = sum(math.sqrt(of.own.mean()) for of in sums[0])
+    scale = sum(math.sqrt(squares.own.mean()) for squares in sums[0])
     if scale == 0:
         raise DataError("The slices cannot be scored, because the held-out projections show no sample.")
-    residuals = [np.sum([np.sqrt(of.left) for of in row], axis=0) / scale for row in sums]
+    residuals = [np.sum([np.sqrt(squares.squares) for squares in row], axis=0) / scale for row in sums]
     predictions = (Prediction(name, residual.tolist()) for name, residual in zip(slices, residuals, strict=True))
     return TrialChoice(f"{len(common)} views", _LEAST_CHANGE if direct else 0.0, tuple(predictions)), same
 
 
 def shares_of(choice: TrialChoice) -> list[float]:
     """[candidate] the residual in all held-out projections together, as in `recon.judgement`."""
-    return [float(np.sqrt(np.square(left).mean())) for left in choice.tried.values()]
+    return [float(np.sqrt(np.square(residuals).mean())) for residuals in choice.tried.values()]
 
 
 Trials = Sequence[tuple[Mapping[str, str], ReconOptions]]

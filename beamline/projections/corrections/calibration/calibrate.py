@@ -194,10 +194,10 @@ def calibrated(
     views = line_integrals_of(band, frames)
     ids = views.view_ids
     before = geometry_before(band, ids)
-    lit = ~areas(views.masked)
+    measured = ~areas(views.masked)
     try:
         learnt = learn_geometry(
-            views.data, before, terms, progress, None if lit.all() else lit.astype(np.float32)
+            views.data, before, terms, progress, None if measured.all() else measured.astype(np.float32)
         )  # fmt: skip
     except ValueError as error:
         raise DataError(f"{source.path}: the geometry could not be calibrated: {error}. Omit --calibrate.") from error
@@ -244,10 +244,10 @@ def without_learnt_gains(views: PreparedProjections, progress: Progress) -> Step
         learnt = learn_gains(views.seen.data, views.geometry, views.sources.measured, progress)
     except ValueError as error:
         raise DataError(f"--calibrate gains: {error}. Omit --calibrate gains, or give --rings instead.") from error
-    values = {"learnt_gains_held_out_before": learnt.without, "learnt_gains_held_out_after": learnt.left}
+    values = {"learnt_gains_held_out_before": learnt.without, "learnt_gains_held_out_after": learnt.with_gains}
     judged = (
         f"the residual in held-out projections is {learnt.without:.4g} without the correction and "
-        f"{learnt.left:.4g} with it"
+        f"{learnt.with_gains:.4g} with it"
     )
     if learnt.without == 0:
         judged = "the projections show no stripes that come from the detector"
