@@ -273,8 +273,8 @@ class LazyGroup(click.Group):
             if is_defect(error):
                 if ctx.params.get("debug"):
                     raise
-                left = leave_traceback(error, Path())
-                message += f"; the traceback is in {left}" if left else "; --debug shows where"
+                traceback_path = leave_traceback(error, Path())
+                message += f"; the traceback is in {traceback_path}" if traceback_path else "; --debug shows where"
                 message += ". Please report it. Files written before the error are unchanged."
             # A line end without an indent after it belongs to the name of a file.
             click.echo("beamline: " + printable(re.sub(r"\n(?! )", " ", message)), err=True)

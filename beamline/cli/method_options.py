@@ -36,15 +36,15 @@ def checkpoint_input(ctx: click.Context, param: click.Parameter, path: Path | No
     return path
 
 
-def levels_of(given: str | Sequence[float]) -> tuple[float, ...]:
+def levels_of(stated_levels: str | Sequence[float]) -> tuple[float, ...]:
     """Densities from text such as "0.1,0.5", or from a list in a recipe. Raises ValueError for other values."""
-    parts = given.split(",") if isinstance(given, str) else given
+    parts = stated_levels.split(",") if isinstance(stated_levels, str) else stated_levels
     try:
         levels = tuple(float(part) for part in parts)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{given!r} is not a list of densities; expected numbers such as 0.1,0.5") from error
+        raise ValueError(f"{stated_levels!r} is not a list of densities; expected numbers such as 0.1,0.5") from error
     if len(levels) < 2 or any(not low < high for low, high in pairwise(levels)):
-        raise ValueError(f"{given!r}: expected two or more densities in ascending order")
+        raise ValueError(f"{stated_levels!r}: expected two or more densities in ascending order")
     return levels
 
 
@@ -80,19 +80,19 @@ def takers(option: Declared) -> tuple[str, ...]:
     return (*((AUTO,) if option.argument in Auto.takes else ()), *accepting(option.argument))
 
 
-def refuse_other_methods(command: click.Command, given: Collection[str], method: str, *, stated: bool) -> None:
+def refuse_other_methods(command: click.Command, given_names: Collection[str], method: str, *, stated: bool) -> None:
     """Raise UsageError for a given option that belongs to other methods than this one.
 
     Args:
         stated: True if the user chose the method; False if it is the default.
     """
     of_methods = {name: param for name, param in declared(command).items() if param.setting or param.argument}
-    asked = {name: param for name, param in of_methods.items() if name in given}
-    if method in METHODS and all(param.setting for param in asked.values()):
+    given_params = {name: param for name, param in of_methods.items() if name in given_names}
+    if method in METHODS and all(param.setting for param in given_params.values()):
         own = by_name(method)
-        if all(has_setting(own, param.setting) for param in asked.values()):
+        if all(has_setting(own, param.setting) for param in given_params.values()):
             return  # checked before the other methods are asked, because they load torch
-    owners = {name: takers(param) for name, param in asked.items()}
+    owners = {name: takers(param) for name, param in given_params.items()}
     for name in (name for name, methods in owners.items() if method not in methods):
         what = f"it cannot be combined with --method {method}." if stated else _instead(name, owners)
         raise click.UsageError(f"--{name} works only with {', '.join(owners[name])}; {what}")

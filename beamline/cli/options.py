@@ -161,22 +161,23 @@ def declared(command: click.Command) -> dict[str, Declared]:
 
 
 def refuse_contradictions(
-    command: click.Command, given: Collection[str], shown: Mapping[str, str] = MappingProxyType({})
+    command: click.Command, given_names: Collection[str], shown: Mapping[str, str] = MappingProxyType({})
 ) -> None:
     """Raise UsageError if two given options exclude each other, or if a given option requires another one that is
     missing.
 
     Args:
-        given: long names of the options that the user gave, and names of other conditions that options may exclude.
-            shown: the words for these conditions in error messages.
+        given_names: long names of the options that the user gave, and names of other conditions that options may
+            exclude.
+        shown: the words for these conditions in error messages.
     """
     for name, param in declared(command).items():
-        if name not in given:
+        if name not in given_names:
             continue
-        for other in (other for other in param.excludes if other in given):
-            why = f"{shown.get(other, f'--{other}')}: {param.excludes[other]}"
+        for excluded in (excluded for excluded in param.excludes if excluded in given_names):
+            why = f"{shown.get(excluded, f'--{excluded}')}: {param.excludes[excluded]}"
             raise click.UsageError(f"--{name} cannot be combined with {why}. Nothing was computed.")
-        if param.needs is not None and param.needs[0] not in given:
+        if param.needs is not None and param.needs[0] not in given_names:
             raise click.UsageError(f"--{name} {param.needs[1]}")
 
 
@@ -316,9 +317,9 @@ def refuse_shared(files: Mapping[str, Path | None]) -> None:
     Only --checkpoint may replace the file of --resume.
     """
     named = [(option, path) for option, path in files.items() if path is not None]
-    for (first, path), (second, other) in itertools.combinations(named, 2):
-        if {first, second} != {"--checkpoint", "--resume"} and same_file(path, other):
-            raise click.UsageError(f"{first} and {second} are the same file, {other}. Give two different files.")
+    for (first, path), (second, second_path) in itertools.combinations(named, 2):
+        if {first, second} != {"--checkpoint", "--resume"} and same_file(path, second_path):
+            raise click.UsageError(f"{first} and {second} are the same file, {second_path}. Give two different files.")
 
 
 @contextmanager

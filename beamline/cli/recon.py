@@ -129,23 +129,23 @@ def _checked_method(context: click.Context, default: str = "") -> str:
 
     Raises: UsageError: the options cannot be combined.
     """
-    asked, values = names_given(context), context.params
+    given_names, values = names_given(context), context.params
     if slabs_resumed(values["resume"]):
-        asked = asked - {"resume"} | {SLABS_RESUMED}
+        given_names = given_names - {"resume"} | {SLABS_RESUMED}
     method = values["method"]
-    if "reference" in asked and method in (None, AUTO):
+    if "reference" in given_names and method in (None, AUTO):
         method = WITH_REFERENCE
-    if method is not None and method == WITH_REFERENCE and "reference" not in asked:
+    if method is not None and method == WITH_REFERENCE and "reference" not in given_names:
         raise click.UsageError(
             f"--method {method} needs --reference GOOD: an earlier volume of the same sample, or its scan."
         )
     stated = method is not None
     if method is None:
         of_a_method = {name for name, param in declared(context.command).items() if param.setting or param.argument}
-        of_fits = values["follow"] or values["any_setting"] or (of_a_method & asked) - {"budget", "quality"}
-        method = default or (_in_time() if "volumes" in asked else DEFAULT if of_fits else AUTO)
-    refuse_contradictions(context.command, asked, {SLABS_RESUMED: f"--resume {values['resume']}"})
-    refuse_other_methods(context.command, asked, method, stated=stated)
+        of_fits = values["follow"] or values["any_setting"] or (of_a_method & given_names) - {"budget", "quality"}
+        method = default or (_in_time() if "volumes" in given_names else DEFAULT if of_fits else AUTO)
+    refuse_contradictions(context.command, given_names, {SLABS_RESUMED: f"--resume {values['resume']}"})
+    refuse_other_methods(context.command, given_names, method, stated=stated)
     for step in chosen_steps(values) if values["follow"] and streams(method) else ():
         if step.needs_finished:
             raise click.UsageError(step.needs_finished)
@@ -190,7 +190,7 @@ def run_reconstruction(
     limit = values.get("max_residual")
     stop = StopOnSignal(ready=options.follow is not None)
 
-    def made(event: Event) -> None:
+    def count_event(event: Event) -> None:
         """Record when the first volume exists, so that Ctrl-C can keep it.
 
         The first volume exists from the first step or iteration of the method itself. (Events of test reconstructions
@@ -203,7 +203,7 @@ def run_reconstruction(
 
     with events_shown(values["as_json"]) as shown:
         scope = EndsWithParent(stop, sys.stdin.fileno()) if values.get("beside") else stop
-        record = reconstruct_file(options, fan_out(made, shown), SystemClock(), stop_scope=scope)
+        record = reconstruct_file(options, fan_out(count_event, shown), SystemClock(), stop_scope=scope)
     output = str(options.target.output)
     if not values["as_json"]:
         click.echo("\n".join([results(record), *more(record)]))

@@ -115,8 +115,12 @@ class ScanRequest:
         """The values that replace those of the configuration."""
         from beamline.config.load import override_of
 
-        given = self.reference
-        return self.overrides if given is None else (*self.overrides, override_of("recon.reference", given.resolve()))
+        reference = self.reference
+        return (
+            self.overrides
+            if reference is None
+            else (*self.overrides, override_of("recon.reference", reference.resolve()))
+        )
 
     @property
     def unless_live(self) -> Callable[[str], None] | None:
@@ -193,7 +197,7 @@ def _one_scan(
     """
     for sentence in series.left_out if series else ():
         click.echo(f"Warning: {sentence}", err=True)
-    _ask_about(config, asked=not (request.dry or request.rehearse or series))
+    _ask_about(config, interactive=not (request.dry or request.rehearse or series))
     if request.dry:
         _dry_run(config, request.output, series, json_sink, request.as_json)
         return
@@ -206,7 +210,7 @@ def _one_scan(
         raise AlarmError(f"The scan is complete, but {' '.join(faults)} Details are in {result.path.parent}.")
 
 
-def _ask_about(config: Config, *, asked: bool) -> None:
+def _ask_about(config: Config, *, interactive: bool) -> None:
     """Warn about unusual values of the configuration, and ask the user at the terminal whether they are intended.
 
     Raises:
@@ -217,7 +221,7 @@ def _ask_about(config: Config, *, asked: bool) -> None:
     sentences = doubts(config)
     for sentence in sentences:
         click.echo(f"Warning: {sentence}", err=True)
-    if sentences and asked and sys.stdin.isatty() and not click.confirm("Start the scan anyway?", err=True):
+    if sentences and interactive and sys.stdin.isatty() and not click.confirm("Start the scan anyway?", err=True):
         raise ConfigError("The scan was not started, because the values were not confirmed. Nothing has moved.")
 
 
@@ -240,14 +244,14 @@ def _refuse_contradictions(request: ScanRequest) -> None:
     if request.file is None and request.run is None:
         raise click.UsageError("Missing argument 'CONFIG' (or --resume RUN).")
     several = _are_several_scans(request.files)
-    for name, given, of_several in (
+    for name, is_given, of_several in (
         ("--resume", request.run is not None, False),
         ("--page", request.page, False),
         ("--documents", request.documents is not None, False),
         ("--stop-on-failure", request.stop_on_failure, True),
         ("--wait", request.wait, True),
     ):
-        if given and of_several is not several:
+        if is_given and of_several is not several:
             raise click.UsageError(f"{name} works only with {'several scans' if of_several else 'a single scan'}.")
     if request.run is not None and request.overrides and request.file is None:
         raise click.UsageError("--resume continues RUN with the configuration stored in it: leave out --set.")
@@ -271,8 +275,8 @@ def _shown(request: ScanRequest, others: Sequence[Sink], stop: StopRequest) -> I
     """The event sinks of a scan (terminal, page, then `others`), and the function that asks the operator."""
     from beamline.instrument.connect import ask_operator
 
-    with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
-        sinks: list[Sink] = [terminal, *others, *([beside] if request.page else [])]
+    with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as page:
+        sinks: list[Sink] = [terminal, *others, *([page] if request.page else [])]
         yield sinks, lambda question: terminal.ask(question, ask_operator)
 
 
@@ -329,7 +333,8 @@ def take_series(config: Config, request: ScanRequest, others: Sequence[Sink], st
     with _shown(request, others, stop) as (sinks, ask):
         return run_series(
             config, request.output, sinks, stop,
-            lambda one, rest: Commands() if request.no_live else commands_of(one, rest), series=request.run, ask=ask,
+            lambda config, rest: Commands() if request.no_live else commands_of(config, rest),
+            series=request.run, ask=ask,
         )  # fmt: skip
 
 

@@ -238,16 +238,20 @@ def chosen_steps(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
         raise click.UsageError(str(error)) from error
 
 
-def _of_step(asked: Option) -> Callable[..., Any]:
+def _of_step(step_option: Option) -> Callable[..., Any]:
     """The command-line option for an option of a correction step."""
     return option(
-        asked.name,
-        type=NameChoice(asked.choices) if asked.choices else click.Path(path_type=Path) if asked.path else str,
-        callback=parsed(lambda value: asked.parse(str(value))),
-        default=asked.default,
-        show_default=asked.default is not None,
-        metavar=asked.metavar,
-        help=asked.help,
+        step_option.name,
+        type=NameChoice(step_option.choices)
+        if step_option.choices
+        else click.Path(path_type=Path)
+        if step_option.path
+        else str,
+        callback=parsed(lambda value: step_option.parse(str(value))),
+        default=step_option.default,
+        show_default=step_option.default is not None,
+        metavar=step_option.metavar,
+        help=step_option.help,
     )
 
 

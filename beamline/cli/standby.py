@@ -21,8 +21,8 @@ def main() -> None:
     from recon.warm_up import warm_up
 
     warm_up(R2(finish=0))
-    with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as told:  # the next reader of stdin gets the rest
-        if not (line := told.readline()):
+    with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as stdin:  # the next reader of stdin gets the rest
+        if not (line := stdin.readline()):
             return
     log, *words = json.loads(line)
     os.dup2(os.open(log, os.O_WRONLY | os.O_APPEND), sys.stderr.fileno())

@@ -161,8 +161,8 @@ class Terminal:
             self._bar.update(self._tasks[what], completed=done, total=total or None, note=note)
             return
         now = time.monotonic()
-        last, at = self._printed.get(what, (-PLAIN_EVERY, -1))
-        if done == at == total:
+        last, last_done = self._printed.get(what, (-PLAIN_EVERY, -1))
+        if done == last_done == total:
             return
         if now - last >= PLAIN_EVERY or done == total:
             self._printed[what] = now, done
@@ -256,8 +256,9 @@ def fit(reached: FitReached) -> str:
     parts += [f"{reached.n_gaussians} Gaussians"] if reached.n_gaussians else []
     errors = {"residual": reached.residual, "residual of held-out projections": reached.held_out}
     parts += [f"{name} {error:.4f}" for name, error in errors.items() if error is not None and math.isfinite(error)]
-    left = "left for this step" if reached.unit else "left"  # not shown, because other parts of the work may follow
-    parts += [] if reached.eta_s is None else [f"{timedelta(seconds=round(reached.eta_s))} {left}"]
+    # not shown as the time left for the work, because other parts may follow
+    remaining = "left for this step" if reached.unit else "left"
+    parts += [] if reached.eta_s is None else [f"{timedelta(seconds=round(reached.eta_s))} {remaining}"]
     return ", ".join(parts)
 
 
@@ -308,8 +309,12 @@ def _ended(settings: Mapping[str, Any]) -> str:
         "bound": "ended after {} iterations, before the volume had converged (a larger --iterations allows more)",
     }
     how, done = settings.get("ended"), settings.get("ended_after")
-    left = settings.get("last_change")
-    change = "" if how == "still" or left is None else f"; the last four iterations changed the volume by {left:.2%}"
+    last_change = settings.get("last_change")
+    change = (
+        ""
+        if how == "still" or last_change is None
+        else f"; the last four iterations changed the volume by {last_change:.2%}"
+    )
     return words[how].format(done) + change if how in words else ""
 
 

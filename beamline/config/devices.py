@@ -172,7 +172,7 @@ class Simple(Section):
     kind: Literal["simulated", "manual"]
 
 
-def _found(table: str) -> tuple[type[Section], ...]:
+def _installed_sections(table: str) -> tuple[type[Section], ...]:
     """Sections of the families of devices, by the name of the table in their folders."""
     return tuple(in_folders("beamline.config.families", table).values())
 
@@ -183,10 +183,12 @@ if TYPE_CHECKING:
     MonochromatorConfig = NoMonochromator | SceneMonochromator | HandMonochromator | FoundMonochromator
     BeamMonitorConfig = NoBeamMonitor | BeamMonitorSection
 else:
-    ShutterConfig = Union[(Simple, StageOutputShutter, *_found("SHUTTERS"))]
-    FilterConfig = Union[(NoFilter, NamedFilter, MotorFilter, *_found("FILTERS"))]
-    MonochromatorConfig = Union[(NoMonochromator, SceneMonochromator, HandMonochromator, *_found("MONOCHROMATORS"))]
-    BeamMonitorConfig = Union[(NoBeamMonitor, *_found("BEAM_MONITORS"))]
+    ShutterConfig = Union[(Simple, StageOutputShutter, *_installed_sections("SHUTTERS"))]
+    FilterConfig = Union[(NoFilter, NamedFilter, MotorFilter, *_installed_sections("FILTERS"))]
+    MonochromatorConfig = Union[
+        (NoMonochromator, SceneMonochromator, HandMonochromator, *_installed_sections("MONOCHROMATORS"))
+    ]
+    BeamMonitorConfig = Union[(NoBeamMonitor, *_installed_sections("BEAM_MONITORS"))]
 
 
 def _simulated(device: Simple | StageMover | FilterConfig) -> bool:

@@ -19,8 +19,8 @@ def faults(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
     yield from _files(config, shipped)
     yield from _camera(config)
     yield from _triggers(config)
-    numbers = ((at, ".".join(at), value) for at, value in quantities(config.model_dump(exclude={"simulation"})))
-    yield from ((at, doubt(name, value)) for at, name, value in numbers if is_impossible(name, value))
+    numbers = ((keys, ".".join(keys), value) for keys, value in quantities(config.model_dump(exclude={"simulation"})))
+    yield from ((keys, doubt(name, value)) for keys, name, value in numbers if is_impossible(name, value))
     try:
         offset_places(config)
     except ValueError as error:
@@ -39,20 +39,20 @@ def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
     scene = simulation.scene if simulation is not None else None
     if isinstance(scene, str) and not (shipped / scene).is_file():
         scenes = " | ".join(f"scenes/{path.name}" for path in sorted((shipped / "scenes").glob("*.yaml")))
-        at = ("simulation", "scene")
+        key = ("simulation", "scene")
         yield (
-            at,
+            key,
             f"simulation.scene: there is no file {scene}; expected one next to the configuration file, or {scenes}",
         )
 
 
-def quantities(values: Any, at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], float]]:
+def quantities(values: Any, keys: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], float]]:
     """Key path and value of each number in plain values. If a key has several numbers, they share its path."""
     if isinstance(values, dict | list | tuple):
         for name, each in values.items() if isinstance(values, dict) else ((None, each) for each in values):
-            yield from quantities(each, at if name is None else (*at, str(name)))
+            yield from quantities(each, keys if name is None else (*keys, str(name)))
     elif isinstance(values, int | float) and not isinstance(values, bool):
-        yield at, values
+        yield keys, values
 
 
 _ONE_FRAME_A_PULSE = {"trigger_mode": ("normal",), "trigger_times": (1,), "trigger_active": ("edge", "level")}

@@ -76,9 +76,9 @@ def load(
         ConfigError: the configuration has faults. The message lists each with file, line, key, the value found and the
             allowed values. Nothing has been started.
     """
-    found = read_config(path, overrides, environment, rehearse=rehearse, no_live=no_live)
-    _refuse(str(path), found.faults)
-    return found.config
+    read = read_config(path, overrides, environment, rehearse=rehearse, no_live=no_live)
+    _refuse(str(path), read.faults)
+    return read.config
 
 
 def read_config(
@@ -103,10 +103,10 @@ def read_config(
         if isinstance(scan, dict) and scan.get("decide") in ("ask", "do"):
             no_live(f"{path}: {NO_DECISIONS.format(scan['decide'])}")
         tree = override(tree, NO_LIVE, {}, takes_text)
-    found = _checked(tree, str(path))
-    if not rehearse or found.faults:
-        return found
-    return _checked(Tree(rehearsal(found.config), tree.origins), str(path))
+    read = _checked(tree, str(path))
+    if not rehearse or read.faults:
+        return read
+    return _checked(Tree(rehearsal(read.config), tree.origins), str(path))
 
 
 def load_as(model: type[AnySection], path: Path, overrides: Iterable[str] = (), *, printed_by: str) -> AnySection:
@@ -143,10 +143,10 @@ def _read_file(path: Path, printed_by: str) -> Tree:
     return read(text, str(path))
 
 
-def takes_text(keys: Sequence[str], of: Mapping[str, Any] | None = None) -> bool:
-    """True if a key of the configuration accepts any text, and nothing else except null. `of`: JSON schema of another
-    configuration."""
-    legal = declared_at(schema() if of is None else of, tuple(keys), None)
+def takes_text(keys: Sequence[str], json_schema: Mapping[str, Any] | None = None) -> bool:
+    """True if a key of the configuration accepts any text, and nothing else except null. `json_schema`: JSON
+    schema of another configuration."""
+    legal = declared_at(schema() if json_schema is None else json_schema, tuple(keys), None)
     kinds = {None if "enum" in each or "const" in each else each.get("type") for each in legal}
     return "string" in kinds and kinds <= {"string", "null"}
 
@@ -195,9 +195,9 @@ def override_of(key: str, value: object) -> str:
 
 
 def _validated(tree: Tree, name: str) -> Config:
-    found = _checked(tree, name)
-    _refuse(name, found.faults)
-    return found.config
+    read = _checked(tree, name)
+    _refuse(name, read.faults)
+    return read.config
 
 
 def _checked(tree: Tree, name: str) -> ReadConfig:
@@ -207,16 +207,18 @@ def _checked(tree: Tree, name: str) -> ReadConfig:
     except ValidationError as error:
         _refuse(name, explain(error, tree, schema()))
         raise
-    return ReadConfig(config, tree, [(tree.origin(at), what) for at, what in faults(config, config_folder())])
+    return ReadConfig(config, tree, [(tree.origin(keys), what) for keys, what in faults(config, config_folder())])
 
 
-def _refuse(path: str, found: Sequence[tuple[str, str]]) -> None:
-    lines = [f"{place}: {fault}" for place, fault in found]
+def _refuse(path: str, faults_found: Sequence[tuple[str, str]]) -> None:
+    lines = [f"{place}: {fault}" for place, fault in faults_found]
     if len(lines) == 1:
-        raise ConfigError(f"{lines[0]}{'' if lines[0].endswith('?') else '.'} Nothing was started.", found) from None
+        raise ConfigError(
+            f"{lines[0]}{'' if lines[0].endswith('?') else '.'} Nothing was started.", faults_found
+        ) from None
     if lines:
         whole = "".join(f"\n  {line}" for line in lines)
-        raise ConfigError(f"{path} has {len(lines)} faults, nothing was started:{whole}", found) from None
+        raise ConfigError(f"{path} has {len(lines)} faults, nothing was started:{whole}", faults_found) from None
 
 
 def resolved_yaml(config: Section) -> str:

@@ -385,8 +385,8 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _energy_can_be_set(self) -> Self:
-        one, several = self.scan.energy, self.scan.energies
-        if one is not None and several is not None:
+        energy, several = self.scan.energy, self.scan.energies
+        if energy is not None and several is not None:
             raise ValueError("scan.energy and scan.energies exclude each other; give one of them")
         if several is not None and self.scan.states is not None:
             raise ValueError("scan.energies and scan.states exclude each other; give one of them")

@@ -76,8 +76,8 @@ def _plain(section: Section) -> dict[str, Any]:
 def _stage(stage: StageSection) -> dict[str, Any]:
     """The stage at the port of the simulated controller. It has a separate transcript, which can be compared with that
     of the real stage."""
-    other = stage.settings.stand_in
-    values = (_stand_in(stage, other) if other else _plain(stage)) | {"port": f"sim://{other or stage.kind}"}
+    stand_in = stage.settings.stand_in
+    values = (_stand_in(stage, stand_in) if stand_in else _plain(stage)) | {"port": f"sim://{stand_in or stage.kind}"}
     if values.get("transcript"):
         path = Path(values["transcript"])
         values["transcript"] = str(path.with_name(f"{path.stem}{_MARK}{path.suffix}"))

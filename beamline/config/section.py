@@ -45,9 +45,9 @@ class Section(BaseModel):
             truths, value = (field.annotation, *get_args(field.annotation)), data.get(name)
             if isinstance(value, bool) and bool not in truths:
                 raise ValueError(f"{name} is {str(value).lower()} (YAML reads yes, no, on and off as true and false)")
-            if isinstance(value, str) and name not in SEVERAL_LINES and (found := min(value, default=" ")) < " ":
+            if isinstance(value, str) and name not in SEVERAL_LINES and (lowest := min(value, default=" ")) < " ":
                 raise ValueError(
-                    f"{name} is {value!r}, with the control character {found!r}. In double quotes a "
+                    f"{name} is {value!r}, with the control character {lowest!r}. In double quotes a "
                     "backslash starts such a character; write the text without quotes, or in single "
                     "quotes"
                 )
@@ -57,19 +57,24 @@ class Section(BaseModel):
 def declared(settings: type[Any]) -> dict[str, Any]:
     """Type and default of the key for each field of a driver's settings, for `section_of`."""
     types = _types(settings)
-    return {made.key_of(name): _declared(made, types[name]) for name, made in settings_of(settings).items()}
+    return {setting.key_of(name): _declared(setting, types[name]) for name, setting in settings_of(settings).items()}
 
 
 def read_from(section: Section, settings: type[Any]) -> Any:
     """The driver's settings from a section with the same keys."""
-    types, told = _types(settings), settings_of(settings).items()
-    return settings(**{name: _inside(made, types[name], getattr(section, made.key_of(name))) for name, made in told})
+    types, own_settings = _types(settings), settings_of(settings).items()
+    return settings(
+        **{
+            name: _inside(setting, types[name], getattr(section, setting.key_of(name)))
+            for name, setting in own_settings
+        }
+    )
 
 
-def _inside(made: Setting, kind: Any, value: Any) -> Any:
+def _inside(setting: Setting, kind: Any, value: Any) -> Any:
     """The value of a key for the driver, converted to the unit and type of the field."""
     cast = next((each for each in (kind, *get_args(kind)) if _is(each, StrEnum, Path)), None)
-    return made.inside(value) if cast is None or value is None else cast(value)
+    return setting.inside(value) if cast is None or value is None else cast(value)
 
 
 def _is(kind: Any, *kinds: type[Any]) -> bool:
@@ -77,14 +82,14 @@ def _is(kind: Any, *kinds: type[Any]) -> bool:
     return isinstance(kind, type) and issubclass(kind, kinds)
 
 
-def _declared(made: Setting, kind: Any) -> tuple[Any, Any]:
+def _declared(setting: Setting, kind: Any) -> tuple[Any, Any]:
     """Type and default of the key of a field, in the form that pydantic needs."""
     members = (
         Literal[tuple(choice.value for choice in each)] if _is(each, StrEnum) else str if _is(each, Path) else each
         for each in (get_args(kind) if get_origin(kind) is UnionType else (kind,))
     )
-    default = made.default.value if isinstance(made.default, StrEnum) else made.default
-    return Annotated[Union[tuple(members)], made], ... if default is MISSING else default  # noqa: UP007
+    default = setting.default.value if isinstance(setting.default, StrEnum) else setting.default
+    return Annotated[Union[tuple(members)], setting], ... if default is MISSING else default  # noqa: UP007
 
 
 def section_of(name: str, base: type[Section], keys: Mapping[str, Any], doc: str | None = None) -> Any:

@@ -66,10 +66,10 @@ class StageSection(Section):
         low, high = (getattr(self, key) for key in ("low_deg", "high_deg"))
         if not low < high:
             raise ValueError(f"low_deg {low} must lie below high_deg {high}")
-        if self.simulated and (other := STAGES[self.kind].Settings.stand_in):
+        if self.simulated and (stand_in := STAGES[self.kind].Settings.stand_in):
             raise ValueError(
                 f"a {self.kind} stage has no simulated controller, so {self.port} is not a valid port. "
-                f"Simulate a stage with kind: {other}, port: sim://{other}, or set the real port and "
+                f"Simulate a stage with kind: {stand_in}, port: sim://{stand_in}, or set the real port and "
                 "rehearse with --rehearse"
             )
         if self.simulated and self.port.lower() != f"sim://{self.kind}":

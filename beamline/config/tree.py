@@ -219,13 +219,13 @@ def _locate(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, st
     of_keys = isinstance(node, yaml.MappingNode)
     for index, item in enumerate([] if isinstance(node, yaml.ScalarNode) else node.value):
         key, child = item if of_keys else (item, item)
-        at, line = (*path, str(key.value) if of_keys else index), key.start_mark.line + 1
-        if at in origins:
-            full, before = ".".join(map(str, at)), origins[at].rpartition(":")[2]
+        keys, line = (*path, str(key.value) if of_keys else index), key.start_mark.line + 1
+        if keys in origins:
+            full, before = ".".join(map(str, keys)), origins[keys].rpartition(":")[2]
             fault = f"{full} appears twice (also in line {before}); keep one"
             raise ConfigError(f"{name}:{line}: {fault}. Nothing was started.", [(f"{name}:{line}", fault)])
-        origins[at] = f"{name}:{line}"
-        _locate(child, at, name, origins)
+        origins[keys] = f"{name}:{line}"
+        _locate(child, keys, name, origins)
 
 
 Override = str | tuple[str, str]
@@ -253,8 +253,8 @@ def override(
     for name, value in sorted(environment.items()):
         if name.startswith(ENVIRONMENT_PREFIX) and "__" in name:
             changes.append((name.removeprefix(ENVIRONMENT_PREFIX).lower().split("__"), value, name))
-    for given in overrides:
-        word, place = (given, f"--set {given}") if isinstance(given, str) else given
+    for stated in overrides:
+        word, place = (stated, f"--set {stated}") if isinstance(stated, str) else stated
         key, equals, value = word.partition("=")
         if not equals or not key.strip():
             raise ConfigError(f"{place}: expected section.key=value, such as --set scan.period_s=0.2")
@@ -293,5 +293,5 @@ def explain(error: ValidationError, tree: Tree, schema: Schema) -> list[tuple[st
     Args:
         schema: the model's JSON schema, from which the legal keys and values are read.
     """
-    found = faults_of(error.errors(include_url=False), tree.data, schema, former=REMOVED, advice=_ADVICE)
-    return [(tree.origin(fault.key), fault.sentence) for fault in found]
+    own_faults = faults_of(error.errors(include_url=False), tree.data, schema, former=REMOVED, advice=_ADVICE)
+    return [(tree.origin(fault.key), fault.sentence) for fault in own_faults]

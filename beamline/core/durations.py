@@ -77,5 +77,5 @@ class Phases:
             self._begun = now
         self._name = ""
 
-    def _say(self, n: int, of: int, per_s: float | None, eta_s: float | None) -> None:
-        self._sink(PhaseReached("phase", self._counted, self._name, n, of, per_s, eta_s, time=self._clock.now()))
+    def _say(self, n: int, total: int, per_s: float | None, eta_s: float | None) -> None:
+        self._sink(PhaseReached("phase", self._counted, self._name, n, total, per_s, eta_s, time=self._clock.now()))

@@ -153,8 +153,8 @@ def leave_traceback(error: BaseException, folder: Path) -> Path | None:
     """Write the traceback of a defect to a new file, in `folder` or in the folder for temporary files; None if neither
     folder is writable. If the error already has such a file, this file is kept.
     """
-    if (left := getattr(error, "traceback_file", None)) is not None:
-        return Path(left)
+    if (traceback_file := getattr(error, "traceback_file", None)) is not None:
+        return Path(traceback_file)
     text = "".join(traceback.format_exception(error))
     for place in (folder, Path(tempfile.gettempdir())):
         with suppress(OSError):

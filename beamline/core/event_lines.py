@@ -20,15 +20,15 @@ LARGEST_LOG = 2**30
 
 def event_of(values: Mapping[str, Any]) -> Event:
     """The event in a JSON line that another process wrote. Raises ValueError if no kind of event has these values."""
-    given = {name: value for name, value in values.items() if name != "event"}
+    fields_given = {name: value for name, value in values.items() if name != "event"}
     for each in KINDS.get(str(values.get("event")), ()):
         spread = {item.name: item.metadata[SPREAD][1] for item in fields(each) if SPREAD in item.metadata}
         own = {item.name for item in fields(each) if item.name not in spread}
-        rest = {name: value for name, value in given.items() if name not in own}
+        rest = {name: value for name, value in fields_given.items() if name not in own}
         # the class has other fields, or the values do not belong to the dataclass whose values are spread
         with suppress(TypeError):
-            taken = {name: made(**rest) for name, made in spread.items()} or rest
-            return each(**{name: value for name, value in given.items() if name in own}, **taken)
+            taken = {name: kind(**rest) for name, kind in spread.items()} or rest
+            return each(**{name: value for name, value in fields_given.items() if name in own}, **taken)
     raise ValueError(f"no event has the values {dict(values)}")
 
 

@@ -330,8 +330,10 @@ def atomic_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
         except OSError as error:  # Windows does not replace a file that another program holds open
             raise DataError(f"{path} could not be replaced ({error}); the existing file was not changed.") from error
     except OSError as error:
-        left = "the existing file was not changed" if replace else "no incomplete file was left behind"
-        raise DataError(f"{path} could not be written ({error.strerror or error}). Check the disk; {left}.") from error
+        what_remains = "the existing file was not changed" if replace else "no incomplete file was left behind"
+        raise DataError(
+            f"{path} could not be written ({error.strerror or error}). Check the disk; {what_remains}."
+        ) from error
     finally:
         # Windows does not remove an open file, and after an error such as a full disk the file is still open
         with suppress(PermissionError):
@@ -346,13 +348,13 @@ def _here() -> str:
 def _remove_remaining(path: Path) -> None:
     """Remove the hidden files that killed programs left next to `path`."""
     with suppress(OSError):
-        for left in [entry for entry in path.parent.iterdir() if entry.name.startswith(f".{path.name}.")]:
-            place, _, process = left.name.removeprefix(f".{path.name}.").rpartition("-")[0].partition("-")
-            if left.suffix == ".partial" and place == _here() and process.isdecimal():
+        for entry in [entry for entry in path.parent.iterdir() if entry.name.startswith(f".{path.name}.")]:
+            place, _, process = entry.name.removeprefix(f".{path.name}.").rpartition("-")[0].partition("-")
+            if entry.suffix == ".partial" and place == _here() and process.isdecimal():
                 import psutil  # imported here, because most commands find no such files
 
                 if not psutil.pid_exists(int(process)):
-                    remove(left)
+                    remove(entry)
 
 
 def write_whole(path: Path, content: bytes | str, *, replace: bool = False) -> None:

@@ -112,7 +112,7 @@ def _library(error: BaseException) -> str:
         (str(frame.f_globals.get("__name__")).partition(".")[0], frame.f_code.co_name)
         for frame, _ in walk_tb(error.__traceback__)
     ]
-    last = max((at for at, (root, _) in enumerate(frames) if _ours(root)), default=-1)
+    last = max((index for index, (root, _) in enumerate(frames) if _ours(root)), default=-1)
     called = [frame for frame in frames[last + 1 :] if frame[0] not in _IMPORTERS]
     return next((root for root, what in called[:1] if failed or what == "<module>"), "")
 

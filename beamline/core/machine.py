@@ -80,9 +80,9 @@ def machine() -> dict[str, str | int]:
     }
 
 
-def machine_line(found: dict[str, str | int] | None = None) -> str:
+def machine_line(facts: dict[str, str | int] | None = None) -> str:
     """`machine()` as one line of text, which can be printed next to measured times."""
-    m = found or machine()
+    m = facts or machine()
     return (
         f"{m['processor']}, {count(int(m['cores']), 'core')}, {count(int(m['threads']), 'thread')}, {m['system']}, "
         f"Python {m['python']}, torch {m['torch']}, numba {m['numba']}"

@@ -47,8 +47,8 @@ def python() -> str:
     Raises: NoPythonError: no such program was found.
     """
     inside = ("bin/python{}.{}".format(*sys.version_info), "python.exe", "Scripts/python.exe")
-    beside = [str(Path(prefix, name)) for prefix in (sys.prefix, sys.base_prefix) for name in inside]
-    programs = [each or "" for each in (sys.executable, getattr(sys, "_base_executable", ""), *beside)]
+    candidates = [str(Path(prefix, name)) for prefix in (sys.prefix, sys.base_prefix) for name in inside]
+    programs = [each or "" for each in (sys.executable, getattr(sys, "_base_executable", ""), *candidates)]
     ours = (each for each in programs if re.search("(?i)python|pypy", Path(each).name) and Path(each).is_file())
     if program := os.environ.get(PYTHON) or next(ours, None):
         return program
@@ -198,9 +198,9 @@ class ChildProcess:
         if grace > 0:
             self._process.terminate()
             deadline = time.monotonic() + grace
-            while (left := deadline - time.monotonic()) > 0 and not hurry():
+            while (remaining := deadline - time.monotonic()) > 0 and not hurry():
                 with suppress(subprocess.TimeoutExpired):
-                    self._process.wait(min(_POLL, left))
+                    self._process.wait(min(_POLL, remaining))
                     return
         self._process.kill()
         self._process.wait()
@@ -297,9 +297,9 @@ class EndsWithParent:
 
 def with_our_path() -> dict[str, str]:
     """The environment for a child process that imports the same modules as this process."""
-    given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    stated = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     # The path contains the working folder if this process was started with `python -m`.
-    path = [folder for folder in sys.path if folder and (folder != str(Path.cwd()) or folder in given)]
+    path = [folder for folder in sys.path if folder and (folder != str(Path.cwd()) or folder in stated)]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
 
 

@@ -64,7 +64,7 @@ class PlausibleRange:
 
     def plausible_as(self, value: float) -> dict[str, float]:
         """Plausible meanings of the value: for each other unit that it may have, the value converted to this unit."""
-        return {other: value * factor for other, factor in self.others.items() if self.holds(value * factor)}
+        return {unit: value * factor for unit, factor in self.others.items() if self.holds(value * factor)}
 
 
 _MS, _COUNTS = {"ms": 1e-3, "us": 1e-6}, "counts of 0.001 degrees"
@@ -106,7 +106,7 @@ bits."""
 def range_of(name: str) -> PlausibleRange | None:
     """The range of a setting by its name, such as `scan.exposure_s`; None if its unit is not known."""
     words = name.rpartition(".")[2].split("_")
-    ends = ("_".join(words[at:]) for at in range(1 if "per" in words else len(words)))
+    ends = ("_".join(words[first:]) for first in range(1 if "per" in words else len(words)))
     return next((RANGES[end] for end in ends if end in RANGES), None)
 
 
@@ -116,7 +116,7 @@ def doubt(name: str, value: float | None) -> str:
     known = range_of(name)
     if value is None or known is None or known.holds(value):
         return ""
-    meant = [f"{each:.4g} {known.unit} ({value:.6g} {other})" for other, each in known.plausible_as(value).items()]
+    meant = [f"{each:.4g} {known.unit} ({value:.6g} {unit})" for unit, each in known.plausible_as(value).items()]
     factor = max(abs(value) / known.high, known.low / abs(value))
     return (
         f"{name} = {value:.6g} {known.unit} is outside the usual range of {known.low:g} to {known.high:g} "

@@ -63,9 +63,9 @@ def device_states(config: Config, clock: Clock, usb: Any = None) -> Iterator[Dev
 def _link(camera: DcamOrca, usb: Any) -> DeviceState:
     """The camera on USB, from its USB descriptors. These also show a slow link that would lose frames."""
     session = import_module(f"drivers.{camera.kind}.session")
-    found = session.preflight(product=camera.usb_product, serial=camera.usb_serial, backend=usb)
-    usable = found.verdict not in (session.Verdict.SLOW, session.Verdict.ABSENT)
-    return DeviceState("camera link", "" if usable else found.message, {"usb": found.message} if usable else {})
+    link = session.preflight(product=camera.usb_product, serial=camera.usb_serial, backend=usb)
+    usable = link.verdict not in (session.Verdict.SLOW, session.Verdict.ABSENT)
+    return DeviceState("camera link", "" if usable else link.message, {"usb": link.message} if usable else {})
 
 
 def _devices(config: Config, clock: Clock, opened: ExitStack) -> Iterator[tuple[str, Callable[[], Any]]]:
@@ -93,8 +93,8 @@ def _devices(config: Config, clock: Clock, opened: ExitStack) -> Iterator[tuple[
         return stages[0]
 
     def shutter() -> Any:
-        found = shutter_of(config, stages[0], clock, ask_operator)
-        return None if found.by_hand else held(found) if isinstance(found, ConnectedShutter) else found
+        shutter = shutter_of(config, stages[0], clock, ask_operator)
+        return None if shutter.by_hand else held(shutter) if isinstance(shutter, ConnectedShutter) else shutter
 
     yield "stage", stage
     camera: Any = wanted.camera
