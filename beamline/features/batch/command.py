@@ -93,7 +93,7 @@ def run_batch(scans: Sequence[Path], recipe: Path | None, folder: Path, sink: Si
         _write(folder, rows)
         waiting = [n for n, row in enumerate(rows) if not row.has_volume]
         for n in in_turn("batch", waiting, lambda n: rows[n].scan, sink, clock):
-            row = rows[n] = _one(rows[n], folder / rows[n].name, how, sink, clock)
+            row = rows[n] = _reconstruct_row(rows[n], folder / rows[n].name, how, sink, clock)
             _write(folder, rows)
             state = row.state + (f" with {count(row.warnings, 'warning')}" if row.warnings else "")
             sentence = f"{row.name}: {state}, {row.seconds:.0f} s{', ' + row.message if row.message else ''}"
@@ -131,13 +131,13 @@ def _begin(folder: Path, recipe: bytes) -> None:
             partial.mkdir()
             (partial / RECIPE).write_bytes(recipe)
             _write(partial, [])
-    kept = folder / RECIPE
+    stored_recipe = folder / RECIPE
     if not (folder / TABLE).is_file():
         raise DataError(f"{folder} exists, but is not the folder of a batch: it has no {TABLE}. Name another folder.")
-    if not kept.is_file() or kept.read_bytes() != recipe:
+    if not stored_recipe.is_file() or stored_recipe.read_bytes() != recipe:
         raise DataError(
-            f"{folder} has results of another recipe, {kept}. Use that recipe (--config {kept}), or name another "
-            "folder. Nothing was changed."
+            f"{folder} has results of another recipe, {stored_recipe}. Use that recipe (--config {stored_recipe}), or "
+            "name another folder. Nothing was changed."
         )
 
 
@@ -156,7 +156,7 @@ def _rows(scans: Sequence[Path], earlier: Sequence[BatchRow]) -> list[BatchRow]:
     return [*rows, *(BatchRow(name, str(path)) for name, path in zip(names_of(new, rows), new, strict=True))]
 
 
-def _one(row: BatchRow, place: Path, how: Sequence[str], sink: Sink, clock: Clock) -> BatchRow:
+def _reconstruct_row(row: BatchRow, place: Path, how: Sequence[str], sink: Sink, clock: Clock) -> BatchRow:
     """Reconstruct a scan with these options, and write the results to the folder `place`."""
     began, last, warned = clock.now(), dict[str, Any](), list[str]()
 
@@ -312,8 +312,8 @@ def batch(scans: list[Path], config: Path | None, output: Path, as_json: bool) -
         failed = [row for row in rows if not row.has_volume]
         warned = sum(row.has_volume and row.warnings > 0 for row in rows)
         counts = {"done": len(rows) - len(failed), "warned": warned, "failed": len(failed), "output": output / TABLE}
-        some = f", {warned} with warnings" if warned else ""
-        every = [] if failed else [f"{len(rows)} of {len(rows)} scans have a volume{some}: {output / TABLE}"]
+        with_warnings = f", {warned} with warnings" if warned else ""
+        every = [] if failed else [f"{len(rows)} of {len(rows)} scans have a volume{with_warnings}: {output / TABLE}"]
         answer.done(counts, *every)
     if failed:
         raise DataError(f"{len(failed)} of {len(rows)} scans failed; {output / TABLE} says why.")

@@ -151,7 +151,7 @@ def _compare(
         prepared = prepared.stating(axis=axis_of(record.parameters))
     grid = Grid.matching(prepared.geometry)
     ideal = truth(grid)
-    made = Reconstruction(
+    reconstruction = Reconstruction(
         volume=Volume(record.volume.data, grid),
         method=shown.method,
         seconds=record.metrics["seconds"],
@@ -163,4 +163,4 @@ def _compare(
     if target.live_picture.exists():
         facts = replace(facts, live_picture=target.live_picture.name)
     context = ReportContext(facts, selection, shown.command, shown.seed, warnings, shown.started)
-    write_result(MadeVolume(made, prepared, ideal, target, context), sink, clock)
+    write_result(MadeVolume(reconstruction, prepared, ideal, target, context), sink, clock)

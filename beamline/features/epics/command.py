@@ -42,9 +42,11 @@ def ioc(runs: Path, prefix: str, bind: str, control: bool) -> None:
     from beamline.page.followed_run import PERIOD
 
     with closing(RunServer(runs, prefix, bind, control, say)) as server, suppress(KeyboardInterrupt):
-        found = "by broadcast" if bind == "0.0.0.0" else f"if EPICS_PVA_ADDR_LIST={bind} is set in their environment"
+        discovery = (
+            "by broadcast" if bind == "0.0.0.0" else f"if EPICS_PVA_ADDR_LIST={bind} is set in their environment"
+        )
         click.echo(
-            f"Publishing {prefix}ScanStatus and others at {bind}. Clients find them {found} (docs/page.md). Ctrl-C "
+            f"Publishing {prefix}ScanStatus and others at {bind}. Clients find them {discovery} (docs/page.md). Ctrl-C "
             "ends this command, not the scan."
         )
         while True:

@@ -269,8 +269,8 @@ def _suggestion(record: ReconRecord) -> str:
 
     depth = record.volume.grid.shape[0]
     chosen = spread(np.arange(depth), _SLICES)
-    some = [np.asarray(record.volume.data[z : z + 1], np.float32) for z in chosen.tolist()]
-    values = np.concatenate([some_values(values, _VALUES) for values in some])
+    slices = [np.asarray(record.volume.data[z : z + 1], np.float32) for z in chosen.tolist()]
+    values = np.concatenate([some_values(values, _VALUES) for values in slices])
     values = values[np.isfinite(values)]
     if not values.size:
         return "The slices that were read have no finite value. Nothing was written."

@@ -80,13 +80,13 @@ def info(
     from beamline.features.files.validate import describe
     from beamline.storage.readers.open import SourceOptions
 
-    light = light_asked(photons_per_count, dose_in)
-    if (output is not None or light is not None) and not statistics:
+    light_request = light_asked(photons_per_count, dose_in)
+    if (output is not None or light_request is not None) and not statistics:
         raise click.UsageError("-o and --photons-per-count work only with --statistics.")
     if statistics and (truth or masks):
         raise click.UsageError("--statistics is for scans, --truth and --masks are for volumes: leave out one of them.")
     if statistics:
-        _print_statistics(SourceOptions(file, **scan_facts), output, light, as_json)
+        _print_statistics(SourceOptions(file, **scan_facts), output, light_request, as_json)
     elif truth or masks:
         _print_measured(file, truth, masks, as_json)
     else:
@@ -110,7 +110,9 @@ def _described(facts: Mapping[str, Any]) -> list[str]:
     return [*lines, *(f"! {message}" for message in facts["findings"])]
 
 
-def _print_statistics(scan: SourceOptions, output: Path | None, light: LightAsked | None, as_json: bool) -> None:
+def _print_statistics(
+    scan: SourceOptions, output: Path | None, light_request: LightAsked | None, as_json: bool
+) -> None:
     from beamline.monitor.digest import LARGEST
     from beamline.projections.scan_statistics import histograms, light_of, statistics_of, table
     from beamline.storage.readers.open import open_scan
@@ -119,10 +121,10 @@ def _print_statistics(scan: SourceOptions, output: Path | None, light: LightAske
         if output is not None:
             refuse_existing(output)
         with open_scan(scan) as source:
-            if light is not None:
-                light.refuse_impossible(source)
+            if light_request is not None:
+                light_request.refuse_impossible(source)
             statistics = statistics_of(source, answer.counting("statistics"))
-            dose = [] if light is None else light_of(source, statistics, light).in_words()
+            dose = [] if light_request is None else light_of(source, statistics, light_request).in_words()
         rows = table(statistics)
         if output is not None:
             write_whole(output, histograms(statistics))

@@ -90,8 +90,8 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
     try:
         if not stated and volume_format(path) is not None:
             of_all: dict[Finding, None] = {}
-            for at in range(len(times_of(path))) or (None,):
-                with opened_volume(path, at=at) as record, hdf5.readable(path):
+            for time_index in range(len(times_of(path))) or (None,):
+                with opened_volume(path, at=time_index) as record, hdf5.readable(path):
                     of_all |= dict.fromkeys(volume_findings(record))
             return [*of_all]
         with open_scan(scan) as source:
@@ -124,13 +124,13 @@ def views_lit(scan: ScanEvidence, every: bool) -> Iterator[Finding]:
     looked_at = views if every else spread(views, VIEWS)
     unlit = [] if scan.beam is None else [row for row in looked_at.tolist() if scan.light.unlit(row)]
     if unlit:
-        of = f"{views.size} projections" if every else f"{looked_at.size} projections checked"
+        checked = f"{views.size} projections" if every else f"{looked_at.size} projections checked"
         more = "" if every else " `validate --deep` checks all projections."
         yield Finding(
             "warning",
             "unlit",
-            f"{len(unlit)} of {of} ({frames_text(unlit)}) had no beam: the shutter was closed, the beam was lost, or "
-            f"these frames were never written. `beamline recon` does not use such projections.{more}",
+            f"{len(unlit)} of {checked} ({frames_text(unlit)}) had no beam: the shutter was closed, the beam was lost, "
+            f"or these frames were never written. `beamline recon` does not use such projections.{more}",
         )
 
 
@@ -199,7 +199,11 @@ def describe_volume(path: Path, kind: str, record: ReconRecord) -> Mapping[str, 
         "path": str(path),
         "format": f"volume, {kind}",
         "shape": tuple(grid.shape),
-        **({} if record.series is None else {"times_s": tuple(float(f"{at:.6g}") for at in record.series.seconds)}),
+        **(
+            {}
+            if record.series is None
+            else {"times_s": tuple(float(f"{seconds:.6g}") for seconds in record.series.seconds)}
+        ),
         "dtype": str(data.dtype),
         "bytes": _size(path),
         "voxel_zyx": tuple(float(f"{edge:.6g}") for edge in grid.spacing),

@@ -92,8 +92,8 @@ class Guard:
 
         async def send_with_headers(message: Any) -> None:
             if message["type"] == "http.response.start":
-                given = [(name, value) for name, value in message["headers"] if name.lower() not in _HEADERS]
-                message = {**message, "headers": [*given, *_HEADERS.items()]}
+                own_headers = [(name, value) for name, value in message["headers"] if name.lower() not in _HEADERS]
+                message = {**message, "headers": [*own_headers, *_HEADERS.items()]}
             await send(message)
 
         request = Request(scope)
@@ -111,8 +111,8 @@ class Guard:
             await Response(text, 403, media_type="text/plain")(scope, receive, send_with_headers)
 
 
-def _same(given: str, expected: str) -> bool:
-    return secrets.compare_digest(given.encode(), expected.encode())
+def _same(received: str, expected: str) -> bool:
+    return secrets.compare_digest(received.encode(), expected.encode())
 
 
 def page(reader: Reader, access: Access, log: Callable[[str], None]) -> Starlette:
@@ -220,20 +220,20 @@ class _Server:
         frame, corrected = int(request.path_params["frame"]), request.query_params.get("corrected") == "1"
         region = region_of(request)
 
-        def made(file: Recording) -> Response:
+        def frame_response(file: Recording) -> Response:
             values, shown, factor = file.picture(frame, region, corrected=corrected)
             return tile_of(values, {"frame": frame, "region": astuple(shown), "bin": factor})
 
-        return self._once(made, lambda file: (frame, region, corrected, file.has_references))
+        return self._once(frame_response, lambda file: (frame, region, corrected, file.has_references))
 
     def sinogram(self, request: Request) -> Response:
         row, first = number_of(request, "row"), number_of(request, "first")
 
-        def made(file: Recording) -> Response:
+        def sinogram_response(file: Recording) -> Response:
             lines, views, factor = file.sinogram(row, first)
             return tile_of(lines, {"views": views.tolist(), "bin": factor})
 
-        return self._of_now(made, "sinogram", row, first)
+        return self._of_now(sinogram_response, "sinogram", row, first)
 
     def trace(self, request: Request) -> Response:
         region, first = region_of(request), number_of(request, "first")
@@ -241,15 +241,15 @@ class _Server:
             lambda file: JSONResponse({"first": first, "values": file.trace(region, first)}), "trace", region, first
         )
 
-    def _of_now(self, make: Callable[[Recording], Response], *asked: object) -> Response:
+    def _of_now(self, make: Callable[[Recording], Response], *key: object) -> Response:
         """An answer that is valid until there are more frames."""
-        return self._once(make, lambda file: (file.progress(), *asked))
+        return self._once(make, lambda file: (file.progress(), *key))
 
     def _once(self, make: Callable[[Recording], Response], key: Callable[[Recording], tuple[object, ...]]) -> Response:
         """One answer for all clients that make the same request at the same time. The reading thread makes the
         answer."""
 
-        def kept(file: Recording) -> Response:
+        def cached(file: Recording) -> Response:
             identity = key(file)
             if identity not in self._kept:
                 self._kept[identity] = make(file)
@@ -257,7 +257,7 @@ class _Server:
                     del self._kept[next(iter(self._kept))]
             return self._kept[identity]
 
-        return self._reader.do(kept)
+        return self._reader.do(cached)
 
     def model(self, request: Request) -> Response:
         """The live picture: the newest projection, the projection of the volume at the same angle, and their difference
@@ -283,7 +283,7 @@ class _Server:
         if folder is None or verb is None:
             return JSONResponse({"message": f"{name} is not possible: no scan is running in this folder."}, 404)
         self._log(f"{name}, requested by {client}")
-        asked = ask(folder, verb)
-        while (state := await run_in_threadpool(asked.state)) is None:
+        pending = ask(folder, verb)
+        while (state := await run_in_threadpool(pending.state)) is None:
             await asyncio.sleep(POLL)
         return JSONResponse({"state": str(state)})

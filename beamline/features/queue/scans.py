@@ -98,10 +98,10 @@ def run_queue(
         try:
             path, faults = take(n, config, stop, run)
         except (Exception, KeyboardInterrupt) as error:
-            asked = stop.by_person or isinstance(error, KeyboardInterrupt)
-            status = QueueStatus.STOPPED if asked else QueueStatus.FAILED
+            by_operator = stop.by_person or isinstance(error, KeyboardInterrupt)
+            status = QueueStatus.STOPPED if by_operator else QueueStatus.FAILED
             outcomes.append(ScanOutcome(name, status, run.folder, user_message(error), exit_code(error)))
-            ended = "the operator stopped the queue" if asked else f"{name} failed" if stop_on_failure else ""
+            ended = "the operator stopped the queue" if by_operator else f"{name} failed" if stop_on_failure else ""
         else:
             status = QueueStatus.ALARMS if faults else QueueStatus.COMPLETE
             outcomes.append(ScanOutcome(name, status, path, " ".join(faults), AlarmError.exit_code if faults else 0))
@@ -170,12 +170,12 @@ def _show(plan: QueuePlan, json_sink: Sink, as_json: bool) -> None:
 
 
 def _take_next(
-    request: ScanRequest, of: int, json_sink: Sink, n: int, config: Config, stop: StopRequest, run: RunNotes
+    request: ScanRequest, n_scans: int, json_sink: Sink, n: int, config: Config, stop: StopRequest, run: RunNotes
 ) -> Taken:
     """Run the n-th of the scans of a queue."""
     if request.wait and n:
-        ask_operator(f"Scan {n + 1} of {of}: put the sample {config.sample.name} in place.")
-    click.echo(f"Scan {n + 1} of {of}: {config.sample.name}", err=True)
+        ask_operator(f"Scan {n + 1} of {n_scans}: put the sample {config.sample.name} in place.")
+    click.echo(f"Scan {n + 1} of {n_scans}: {config.sample.name}", err=True)
     sinks: list[Sink] = [json_sink, run]
     if config.series:
         done = take_series(config, request, sinks, stop)

@@ -196,13 +196,13 @@ def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) 
     from beamline.simulate import labels_path
 
     named = {"the scan": out, "its labels": out and labels_path(out), "the truth": truth, "the picture": picture}
-    given = {what: path for what, path in named.items() if path is not None}
-    for (what, first), (other, second) in itertools.combinations(given.items(), 2):
+    given_paths = {what: path for what, path in named.items() if path is not None}
+    for (what, first), (second_option, second) in itertools.combinations(given_paths.items(), 2):
         if same_file(first, second):
             raise ConfigError(
-                f"{second} is given for {what} and for {other}: use two different files. Nothing was simulated."
+                f"{second} is given for {what} and for {second_option}: use two different files. Nothing was simulated."
             )
-    for path in given.values():
+    for path in given_paths.values():
         refuse_existing(path)
 
 

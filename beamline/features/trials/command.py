@@ -223,6 +223,6 @@ def study(request: StudyRequest) -> None:
     settings = row_settings(command, methods, dict(request.values))
     scan = _compared(request, methods)
     folder = request.output or Path(f"{safe_name(request.file.stem)}_{request.which}")
-    asked = STUDIES[request.which]
-    plan = partial(planned_study, scan, asked, settings=settings, ramp=request.ramp, draws=request.draws)
+    chosen_study = STUDIES[request.which]
+    plan = partial(planned_study, scan, chosen_study, settings=settings, ramp=request.ramp, draws=request.draws)
     compare(plan, request.file, folder, as_json=request.as_json)

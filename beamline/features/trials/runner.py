@@ -82,7 +82,7 @@ DataError, nothing was written."""
 
 
 def opened_scan(
-    asked: ComparedScan, name: str, title: str, sink: Sink, clock: Clock, *, held_out: bool
+    compared: ComparedScan, name: str, title: str, sink: Sink, clock: Clock, *, held_out: bool
 ) -> tuple[TrialData, TrialTable]:
     """Check all inputs, then read and correct the projections. The table has no trials yet.
 
@@ -93,19 +93,19 @@ def opened_scan(
     Raises:
         ConfigError, DataError: nothing was written.
     """
-    truth_given = None if asked.truth is None else read_truth(asked.truth)
-    with asked.source.open() as source:
+    truth_given = None if compared.truth is None else read_truth(compared.truth)
+    with compared.source.open() as source:
         facts = dict(facts_of(source).table)
-        prepared = prepare_projections(select(source, asked.selection), Warnings(sink, clock)).without_warnings
+        prepared = prepare_projections(select(source, compared.selection), Warnings(sink, clock)).without_warnings
     if held_out and truth_given is None:
         prepared = hold_out(prepared, ONE_IN, most=_HELD_OUT_VIEWS, advice="give --truth")
     truth = None
     if truth_given is not None:
-        truth = fit_truth(truth_given, Grid.matching(prepared.geometry), asked.selection.binning).data
+        truth = fit_truth(truth_given, Grid.matching(prepared.geometry), compared.selection.binning).data
     by = HELD_OUT if truth is None else "psnr"
     facts["volume"] = " × ".join(map(str, Grid.matching(prepared.geometry).shape))
-    table = TrialTable(name, title, (), by, machine(), facts, asked.command)
-    return TrialData(prepared.views, truth, seed=asked.seed), table
+    table = TrialTable(name, title, (), by, machine(), facts, compared.command)
+    return TrialData(prepared.views, truth, seed=compared.seed), table
 
 
 def _run_and_show(slices: SliceSheet, data: TrialScan, trial: MethodTrial) -> tuple[Outcome, F32 | None]:
@@ -130,7 +130,9 @@ def _run_all(
     """
     trials, todo = [outcome.trial for outcome in table.outcomes], table.todo
     try:
-        for n, index in enumerate(in_turn(table.name, todo, lambda at: trials[at].label, sink, clock), 1):
+        for n, index in enumerate(
+            in_turn(table.name, todo, lambda index_of_trial: trials[index_of_trial].label, sink, clock), 1
+        ):
             trial, whole = trials[index], table
             table = whole.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
             outcome, _ = run(trial)
@@ -146,7 +148,7 @@ def _run_all(
     return table
 
 
-def _event_of(table: TrialTable, n: int, of: int, outcome: Outcome) -> TrialDone:
+def _event_of(table: TrialTable, n: int, total: int, outcome: Outcome) -> TrialDone:
     """The event of a trial that has ended, the n-th of all trials. `gaussians` is the number at the start, as in the
     settings of the trial."""
     trial = outcome.trial
@@ -159,7 +161,7 @@ def _event_of(table: TrialTable, n: int, of: int, outcome: Outcome) -> TrialDone
     }
     quality = outcome.quality(table.by)
     return TrialDone(
-        n, of, trial.label, outcome.status, outcome.seconds, outcome.message, quality, outcome.peak_bytes, figures
+        n, total, trial.label, outcome.status, outcome.seconds, outcome.message, quality, outcome.peak_bytes, figures
     )
 
 
@@ -210,8 +212,8 @@ def run_comparison(plan: Plan, file: Path | str, folder: Path, sink: Sink, clock
     write_table(path, table.records)
     write_page(folder, table, planned.slices)
     summary = {"output": folder, "trials": todo, "done": len(table.compared), "stopped": table.stopped}
-    found = {"best": table.best, "scores": [outcome.metrics.get(table.by) for outcome in table.compared]}
-    sink(Done({**summary, **found, "seconds": clock.now() - began}, time=clock.now()))
+    conclusion = {"best": table.best, "scores": [outcome.metrics.get(table.by) for outcome in table.compared]}
+    sink(Done({**summary, **conclusion, "seconds": clock.now() - began}, time=clock.now()))
     return table
 
 

@@ -72,9 +72,9 @@ def swept_option(text: str, legal: Collection[str]) -> SweptOption:
         )
     tried = _values(name, values)
     if len(tried) < 2:
-        one = f". For a single value use `beamline recon --{name} {tried[0]}`" if tried else ""
+        advice = f". For a single value use `beamline recon --{name} {tried[0]}`" if tried else ""
         raise ValueError(
-            f"a sweep needs at least two values, as NAME=A:B:STEP or NAME=a,b,c, but {text!r} has {len(tried)}{one}"
+            f"a sweep needs at least two values, as NAME=A:B:STEP or NAME=a,b,c, but {text!r} has {len(tried)}{advice}"
         )
     return SweptOption(name, tried)
 

@@ -179,7 +179,7 @@ def _draws(table: TrialTable) -> Iterator[str]:
         parts = []
         for name in figures_of(table):
             values = [row.metrics[name] for row in rows if name in row.metrics]
-            mean, low, high = (_figure(name, float(of(values))) for of in (np.mean, min, max))
+            mean, low, high = (_figure(name, float(statistic(values))) for statistic in (np.mean, min, max))
             parts.append(f"{METRICS[name].short} {mean} ({low} to {high})")
         yield f"{method}, {family}, mean of {len(rows)}: {', '.join(parts)}."
 

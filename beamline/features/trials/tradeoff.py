@@ -48,11 +48,11 @@ def planned_study(
     """
     data, table = opened_scan(scan, "study", study.title, sink, clock, held_out=False)
     choices = study.rows(ViewSet(data.geometry.angles, data.geometry.period, scan.seed, draws))
-    n_views, given = data.geometry.n_views, dict(settings or {})
-    given[BASELINE] = {"filter": ramp, **given.get(BASELINE, {})}
+    n_views, own_settings = data.geometry.n_views, dict(settings or {})
+    own_settings[BASELINE] = {"filter": ramp, **own_settings.get(BASELINE, {})}
 
     def trial(method: str, choice: ViewChoice) -> MethodTrial:
-        own = dict(given.get(method, {}))
+        own = dict(own_settings.get(method, {}))
         return MethodTrial("method", method, choice.n_views, settings=own, choice=choice).in_time(scan.seconds)
 
     outcomes = [(trial(method, choice), choice.reason) for choice in choices for method in scan.methods]
@@ -61,7 +61,7 @@ def planned_study(
         outcomes=tuple(Outcome(each, "not run", message=reason) for each, reason in outcomes),
         by="psnr_all",
         question=study.question,
-        notes=[_note(n_views), *_notes_on_methods({m: given.get(m, {}) for m in scan.methods}, scan.seconds)],
+        notes=[_note(n_views), *_notes_on_methods({m: own_settings.get(m, {}) for m in scan.methods}, scan.seconds)],
         scan={**table.scan, "views to choose from": str(n_views)},
     )
     if not table.todo:
@@ -81,10 +81,10 @@ def planned_study(
 
 def _note(n_views: int) -> str:
     return (
-        f"PSNR all and SSIM all are against the volume of {REFERENCE} ({n_views}) by the same method and settings. "
-        f"Both values show how much is lost with fewer projections, not which method is better. The reference "
-        "volume also has noise. A row has part of the same noise, because it uses some of the same projections; "
-        "this makes its PSNR all and SSIM all too high. A smoother volume has higher SNR and CNR."
+        f"PSNR all and SSIM all compare each volume with the volume that the same method and settings make of "
+        f"{REFERENCE} ({n_views}). Both values show how much is lost with fewer projections, not which method is "
+        "better. They are too high, because the two volumes share projections, and therefore share some noise. "
+        "A smoother volume has higher SNR and CNR."
     )
 
 

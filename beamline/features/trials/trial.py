@@ -75,8 +75,8 @@ class MethodTrial:
         if seconds is None or issubclass(method, Direct):
             return self
         by_time = method.ended_by(seconds)
-        kept = {name: value for name, value in self.settings.items() if name not in by_time}
-        return replace(self, settings=kept, seconds_asked=seconds)
+        untimed = {name: value for name, value in self.settings.items() if name not in by_time}
+        return replace(self, settings=untimed, seconds_asked=seconds)
 
     @property
     def label(self) -> str:
@@ -198,13 +198,13 @@ class TrialTable:
                 front.append(each)
         return front
 
-    def chance(self, one: Outcome, other: Outcome) -> float:
+    def chance(self, first_trial: Outcome, second_trial: Outcome) -> float:
         """Largest difference between two trials in dB that is not significant.
 
         Without a ground truth: two standard errors of the mean difference of squared residuals over the held-out
         projections. The noise of a projection is in both of its residuals, so it cancels in the difference.
         """
-        first, second = (np.asarray(each.squared_residuals) for each in (one, other))
+        first, second = (np.asarray(each.squared_residuals) for each in (first_trial, second_trial))
         if self.by != HELD_OUT or min(first.size, second.size) < 2 or first.size != second.size:
             return LEAST_GAIN
         apart, level = first - second, (first.mean() + second.mean()) / 2

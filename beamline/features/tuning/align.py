@@ -39,7 +39,7 @@ def align_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> tuple[Ax
     Raises: ValueError: the shapes differ, or values are not finite. AxisError: there is no axis in the middle three
     quarters of the columns.
     """
-    tilt, found = 0.0, None
+    tilt, line = 0.0, None
     for _ in range(ROUNDS):
         a, b = (_levelled(view, tilt) for view in (p0, p180))
         whole = axis_from_pair(a, b)
@@ -49,27 +49,27 @@ def align_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> tuple[Ax
         curves = np.stack([mirror_mismatch(a[band], b[band], whole.candidates) for band in rows])
         heights = np.array([band.mean() for band in rows]) - (len(a) - 1) / 2
         try:
-            found = line_through(whole.candidates, curves, heights)
+            line = line_through(whole.candidates, curves, heights)
         except ValueError:
-            found = None
+            line = None
             break
-        tilt += found.tilt
-    if found is None:
+        tilt += line.tilt
+    if line is None:
         return replace(axis_from_pair(p0, p180), confident=whole.confident), None
-    return whole, replace(found, tilt=tilt)
+    return whole, replace(line, tilt=tilt)
 
 
-def finest_structure(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
+def finest_structure(first_image: NDArray[np.floating], second_image: NDArray[np.floating]) -> float:
     """Width in pixels of the finest structure in a projection: the contrast divided by the slope. Both are computed
     from two frames of the same projection, so that noise cancels.
 
     The sharper the image, the smaller this width, for the same sample at the same angle. NaN if there is only noise.
 
     Args:
-        one, other: float [row, col], two frames of the same projection.
+        first_image, second_image: float [row, col], two frames of the same projection.
     """
-    contrast = float(np.mean((one - one.mean()) * (other - other.mean())))
-    slope = sum(float(np.mean(np.diff(one, axis=axis) * np.diff(other, axis=axis))) for axis in range(2))
+    contrast = float(np.mean((first_image - first_image.mean()) * (second_image - second_image.mean())))
+    slope = sum(float(np.mean(np.diff(first_image, axis=axis) * np.diff(second_image, axis=axis))) for axis in range(2))
     return math.sqrt(contrast / slope) if contrast > 0 and slope > 0 else math.nan
 
 
@@ -181,9 +181,9 @@ def evaluate(frames: Sequence[Frame], pixel_size: float) -> Alignment:
     dark = mean_counts(darks)
     intensity = np.maximum(mean_counts(flats) - dark, 1.0)
     integrals = [-np.log(np.maximum(frame.counts - dark, 1.0) / intensity) for frame in views]
-    one, other = (np.mean(integrals[i : i + TWICE], axis=0) for i in (0, TWICE))
+    first_image, second_image = (np.mean(integrals[i : i + TWICE], axis=0) for i in (0, TWICE))
     try:
-        axis, tilt = align_pair(one, other)
+        axis, tilt = align_pair(first_image, second_image)
     except AxisError as error:
         raise QualityError(f"The two projections do not show the axis: {error}") from error
     if not axis.confident:

@@ -138,9 +138,9 @@ def tune(
     frames, settings = take(_blocks(exposures, angle), config, instrument, stop, sink)
     timing = camera.timing
     longest = _longest(plan, settings, timing)
-    found = evaluate(frames, plan, 2.0**timing.bits - 1, longest, reference_limits(config.references))
+    tuning = evaluate(frames, plan, 2.0**timing.bits - 1, longest, reference_limits(config.references))
     path = config.optics.light_path
-    return found if path is None else replace(found, x_rays=path.x_rays_per_count(found.gain))
+    return tuning if path is None else replace(tuning, x_rays=path.x_rays_per_count(tuning.gain))
 
 
 def take(
@@ -189,11 +189,11 @@ def evaluate(
     (view,) = [frame for frame in frames if frame.kind is FrameKind.PROJECTION and frame.exposure == used]
     flat = mean_counts(pair)
     intensity = flat - dark
-    lit = intensity > UNLIT * np.percentile(intensity, BRIGHTEST)
-    of_darks, of_flats = _variance(darks, np.ones(lit.shape, bool)), _variance(pair, lit)
-    typical = float(np.median(intensity[lit]))
-    gain = (of_flats - of_darks) / float(intensity[lit].mean()) if of_flats > of_darks and typical > 0 else math.nan
-    through = (view.counts - dark)[lit] / intensity[lit]
+    exposed = intensity > UNLIT * np.percentile(intensity, BRIGHTEST)
+    of_darks, of_flats = _variance(darks, np.ones(exposed.shape, bool)), _variance(pair, exposed)
+    typical = float(np.median(intensity[exposed]))
+    gain = (of_flats - of_darks) / float(intensity[exposed].mean()) if of_flats > of_darks and typical > 0 else math.nan
+    through = (view.counts - dark)[exposed] / intensity[exposed]
     transmission = float(np.percentile(through, DARKEST)), float(np.median(through))
     brightest = float(np.percentile(digest(flat, preview_bin=BLOCK).preview, BRIGHTEST))
     room = (saturation * TARGET - np.median(dark)) / max(brightest - np.median(dark), 1e-9)
@@ -214,7 +214,7 @@ def evaluate(
         saturation=saturation,
         dark=float(np.median(dark)),
         dark_noise=math.sqrt(of_darks),
-        flat=float(np.median(flat[lit])),
+        flat=float(np.median(flat[exposed])),
         brightest=brightest,
         saturated=float(np.mean([frame.counts >= saturation for frame in flats if frame.exposure == first])),
         gain=gain,
@@ -249,8 +249,8 @@ def _unsaturated(flats: Sequence[Frame], saturation: float, limits: ReferenceLim
 def _variance(pair: Sequence[Frame], where: NDArray[np.bool_]) -> float:
     """Mean variance over pixels, from the difference of two frames. Zingers, and changes of the intensity of the whole
     frame, are left out."""
-    one, other = (frame.counts[where].astype(np.float64) for frame in pair[:2])
-    change = one - other
+    first_image, second_image = (frame.counts[where].astype(np.float64) for frame in pair[:2])
+    change = first_image - second_image
     change -= np.median(change)
     squares = change**2
     return float(squares[squares <= ZINGER**2 * np.median(squares)].mean()) / 2
