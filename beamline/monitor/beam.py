@@ -169,5 +169,5 @@ def _size(score: float) -> str:
 
 def _whole(view: CellView, grid: CellGrid) -> float:
     """Logarithm of the mean transmission of the cells with beam; NaN if there are no such cells."""
-    lit = grid.lit > 0
-    return math.log(float(np.exp(-view.depth[lit]).mean())) if lit.any() else math.nan
+    exposed = grid.exposed > 0
+    return math.log(float(np.exp(-view.depth[exposed]).mean())) if exposed.any() else math.nan

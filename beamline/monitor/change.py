@@ -79,14 +79,14 @@ def change_of(view: CellView, before: Sequence[CellView], grid: CellGrid) -> Sam
     if steps is None:
         return None
     # A change of the gain must not count as a velocity.
-    gained = np.float32(sum(one.brighter for one in last[1:]))
+    gained = np.float32(sum(step.brighter for step in last[1:]))
     weight = np.minimum(view.weight, last[-1].weight)
     velocity = (last[-1].depth - last[0].depth + gained) * np.float32(steps / 3)
     change = view.depth - last[-1].depth - velocity
     # Half a step back, because `change` compares a projection with the previous one: the gradient belongs to the middle
     # between them.
     image = _smooth((last[-1].depth + last[-2].depth) * np.float32(0.5) + velocity)
-    right, below = (np.gradient(image, axis=at) if image.shape[at] > 1 else np.zeros_like(image) for at in (1, 0))
+    right, below = (np.gradient(image, axis=axis) if image.shape[axis] > 1 else np.zeros_like(image) for axis in (1, 0))
     basis = np.stack([np.ones_like(image), -right, -below, _smooth(velocity)])
     solution, variances = _fit(basis, _smooth(change), weight)
     residual = np.where(weight > 0, change - np.tensordot(solution.astype(np.float32), basis, 1), np.float32(0))
@@ -104,7 +104,7 @@ def _steps(view: CellView, last: Sequence[CellView]) -> float | None:
     usual = (last[-1].angle - last[0].angle) / (SPAN - 1)
     if not math.isfinite(usual) or usual == 0:
         return 1.0 if view.angle == last[-1].angle or not math.isfinite(view.angle) else None
-    inner = [after.angle - one.angle for one, after in pairwise(last)]
+    inner = [after.angle - before.angle for before, after in pairwise(last)]
     if max(abs(step / usual - 1) for step in inner) > 0.5:
         return None
     steps = (view.angle - last[-1].angle) / usual
@@ -121,8 +121,8 @@ def _smooth(image: CellValues) -> CellValues:
 def _spread(change: CellValues, weight: CellValues) -> float | None:
     """Standard deviation of the changes for weight 1, from every fifth cell; None if no cell has a weight."""
     sample, weights = change.ravel()[::SAMPLED], weight.ravel()[::SAMPLED]
-    lit = weights > 0
-    return median_deviation(sample[lit] * np.sqrt(weights[lit])) if lit.any() else None
+    weighted = weights > 0
+    return median_deviation(sample[weighted] * np.sqrt(weights[weighted])) if weighted.any() else None
 
 
 def _shares(change: CellValues, weight: CellValues) -> CellValues:

@@ -206,17 +206,17 @@ def photons(flats: Group, darks: Group) -> float | None:
     or blocks, or if the flats have no photon noise.
     """
     intensity = np.mean([flat.blocks for flat in flats], axis=0) - offset(darks)
-    lit = intensity > UNLIT * float(np.nanpercentile(intensity, BRIGHT))
-    beside = lit[:, 1:] & lit[:, :-1]
-    if len(flats) < 2 or (len(flats) - 1) * beside.sum() < LEAST_BLOCKS:
+    exposed = intensity > UNLIT * float(np.nanpercentile(intensity, BRIGHT))
+    exposed_pairs = exposed[:, 1:] & exposed[:, :-1]
+    if len(flats) < 2 or (len(flats) - 1) * exposed_pairs.sum() < LEAST_BLOCKS:
         return None
-    levels = np.array([np.median((flat.blocks - offset(darks))[lit]) for flat in flats])
+    levels = np.array([np.median((flat.blocks - offset(darks))[exposed]) for flat in flats])
     even = np.stack([flat.blocks for flat in flats]) * (levels.mean() / levels)[:, None, None].astype(np.float32)
-    change = np.diff(np.diff(even, axis=0), axis=2)[:, beside]
+    change = np.diff(np.diff(even, axis=0), axis=2)[:, exposed_pairs]
     squares = change.astype(np.float64) ** 2
     variance = float(squares[squares <= ZINGER**2 * np.median(squares)].mean()) / 4 * flats[0].block ** 2
     brought = variance - pixel_noise(darks) ** 2
-    return float(np.median(intensity[lit]) * intensity[lit].mean()) / brought if brought > 0 else None
+    return float(np.median(intensity[exposed]) * intensity[exposed].mean()) / brought if brought > 0 else None
 
 
 def full_scale(largest: float) -> float:

@@ -111,13 +111,13 @@ class FieldOfViewCheck(Logged):
     def _cut(self, row: int, edges: tuple[float, float], grid: CellGrid, entered: bool) -> Flag:
         left, right = edges
         cut = {side: depth for side, depth in (("left", left), ("right", right)) if depth > self.edge}
-        beside = (
+        other_side = (
             " The sample was inside the field of view in earlier projections, so it is not centred on the rotation "
             "axis: centre it."
         ) * (entered and len(cut) == 1)
         advice = (
-            f"{beyond_the_field(cut)}{beside} This has three effects: the check `mass` is switched off, slow floaters "
-            "are not detected, and reconstructions are too bright at the rim."
+            f"{beyond_the_field(cut)}{other_side} This has three effects: the check `mass` is switched off, slow "
+            "floaters are not detected, and reconstructions are too bright at the rim."
         )
         rows, last = grid.shape[0] * grid.cell, grid.right + 1
         first = grid.left if left >= right else max(last - 2, 0)
@@ -178,11 +178,11 @@ class MassCheck(Logged):
             return CheckResult(state)
         if max(at_edges(context)) > AIR:
             return CheckResult(replace(state, running=0))
-        lit = float(grid.lit.mean())
-        if not lit:
+        exposed_share = float(grid.exposed.mean())
+        if not exposed_share:
             return CheckResult(state)
         # Subtract the loss of beam intensity, so that it does not count as absorption.
-        mass = float(view.depth.mean()) / lit - brightest_place(view, grid)
+        mass = float(view.depth.mean()) / exposed_share - brightest_place(view, grid)
         if state.usual is None:
             return CheckResult(_calibrate(state, mass))
         if state.usual < EMPTY:

@@ -192,8 +192,8 @@ class MotionCheck(Logged):
         )
         across, down, turn = (x - s.mean for x, s in zip(change_of_place, usual, strict=True))
         over = abs(across) > limit_across or abs(down) > limit_down or abs(turn) > limit_turn
-        if over and (beside := change.beside_columns()) is not None:
-            right, below, further = (x - s.mean for x, s in zip(beside, usual, strict=True))
+        if over and (beside_columns := change.beside_columns()) is not None:
+            right, below, further = (x - s.mean for x, s in zip(beside_columns, usual, strict=True))
             if math.hypot(right, below) < CONFIRMED * math.hypot(across, down):
                 across, down = right, below
             if abs(further) < CONFIRMED * abs(turn):

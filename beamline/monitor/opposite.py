@@ -79,7 +79,7 @@ class ViewFit:
 class OppositeState:
     """Kept projections, the axis (in columns of pixels) from the first pair, and whether the check is off."""
 
-    kept: tuple[Kept, ...] = ()
+    waiting: tuple[Kept, ...] = ()
     axis: float | None = None
     aside: bool = False
 
@@ -123,44 +123,48 @@ class OppositeCheck(Logged):
             return CheckResult(
                 replace(state, aside=True), Flag(self.name, Level.INFO, frame.index, 0.0, self.warn, advice)
             )
-        kept = _with_view(state.kept, view, frame.replaces, follows=context.follows)
-        state = replace(state, kept=kept)
-        for at, one in enumerate(kept):
-            late = one.after is not None and view.index - one.view.index >= LATER
-            if late and (looked := self._compared(state, at, view, context)) is not None:
+        waiting = _with_view(state.waiting, view, frame.replaces, follows=context.follows)
+        state = replace(state, waiting=waiting)
+        for place, earlier in enumerate(waiting):
+            late = earlier.after is not None and view.index - earlier.view.index >= LATER
+            if late and (looked := self._compared(state, place, view, context)) is not None:
                 return looked
-        return CheckResult(replace(state, kept=tuple(_with_nearer(one, view) for one in kept)))
+        return CheckResult(replace(state, waiting=tuple(_with_nearer(earlier, view) for earlier in waiting)))
 
     def _compared(
-        self, state: OppositeState, at: int, view: CellView, context: ScanContext
+        self, state: OppositeState, place: int, view: CellView, context: ScanContext
     ) -> CheckResult[OppositeState] | None:
         """Compare a projection with a kept projection. Returns None in two cases: the projections are neither opposite
         nor at the same angle; or the step that gives the velocity is so large that only a large motion would be
         visible. In the second case the pair waits for projections that are nearer in angle."""
-        one, grid = state.kept[at], context.grid
-        assert one.after is not None and grid is not None
-        turn, step = _folded(view.angle - one.view.angle), one.after.angle - one.view.angle
-        beside, other = min(BESIDE * abs(step), REACH / (0.5 * grid.shape[1])), math.copysign(math.pi, turn)
-        mirrored = not one.turned and abs(turn - other) <= beside
-        if not mirrored and (one.again or abs(turn) > beside):
+        earlier, grid = state.waiting[place], context.grid
+        assert earlier.after is not None and grid is not None
+        turn, step = _folded(view.angle - earlier.view.angle), earlier.after.angle - earlier.view.angle
+        tolerance, half_turn = min(BESIDE * abs(step), REACH / (0.5 * grid.shape[1])), math.copysign(math.pi, turn)
+        mirrored = not earlier.turned and abs(turn - half_turn) <= tolerance
+        if not mirrored and (earlier.again or abs(turn) > tolerance):
             return None
-        steps = (turn - other if mirrored else turn) / step
-        unsure = self._unsure(one, one.after, steps, grid)
-        fit = lay_on(one, steps, view, grid, mirrored=mirrored) if math.isfinite(unsure) else None
+        steps = (turn - half_turn if mirrored else turn) / step
+        unsure = self._unsure(earlier, earlier.after, steps, grid)
+        fit = lay_on(earlier, steps, view, grid, mirrored=mirrored) if math.isfinite(unsure) else None
         if fit is None:
             return None
         fit = replace(fit, unsure=unsure)
         looked = (
-            self._mirrored(state, one, fit, view, context)
+            self._mirrored(state, earlier, fit, view, context)
             if mirrored
-            else CheckResult(state, self._moved(fit, view.index, f"frame {one.view.index} at the same angle", context))
+            else CheckResult(
+                state, self._moved(fit, view.index, f"frame {earlier.view.index} at the same angle", context)
+            )
         )
         if unsure and looked.flag is None:
             return None
-        one = replace(one, turned=one.turned or mirrored, again=one.again or not mirrored)
-        return replace(looked, state=replace(looked.state, kept=(*state.kept[:at], one, *state.kept[at + 1 :])))
+        earlier = replace(earlier, turned=earlier.turned or mirrored, again=earlier.again or not mirrored)
+        return replace(
+            looked, state=replace(looked.state, waiting=(*state.waiting[:place], earlier, *state.waiting[place + 1 :]))
+        )
 
-    def _unsure(self, one: Kept, after: CellView, steps: float, grid: CellGrid) -> float:
+    def _unsure(self, earlier: Kept, after: CellView, steps: float, grid: CellGrid) -> float:
         """Largest likely error in px of a kept projection extrapolated by some steps, see `ViewFit.unsure`.
 
         After a large step, other material is visible, most of all if the sample is wider than the field of view. If the
@@ -171,8 +175,8 @@ class OppositeCheck(Logged):
         """
         if min(abs(steps), abs(steps - 1)) < BESIDE - 1:
             return 0.0
-        fit, smooth = lay_on(one, 0.0, after, grid, mirrored=False), SMOOTH * grid.cell
-        rim = 0.5 * grid.shape[1] * grid.cell * abs(_folded(after.angle - one.view.angle))
+        fit, smooth = lay_on(earlier, 0.0, after, grid, mirrored=False), SMOOTH * grid.cell
+        rim = 0.5 * grid.shape[1] * grid.cell * abs(_folded(after.angle - earlier.view.angle))
         if (
             fit is None
             or fit.remainder > smooth
@@ -183,7 +187,7 @@ class OppositeCheck(Logged):
         return unsure * (unsure > max(self.changed, LEAST_REMAINDER * grid.cell))
 
     def _mirrored(
-        self, state: OppositeState, one: Kept, fit: ViewFit, view: CellView, context: ScanContext
+        self, state: OppositeState, earlier: Kept, fit: ViewFit, view: CellView, context: ScanContext
     ) -> CheckResult[OppositeState]:
         assert context.grid is not None
         cell, cols = context.grid.cell, context.grid.shape[1]
@@ -191,7 +195,7 @@ class OppositeCheck(Logged):
         first = state.axis is None
         usual = axis if state.axis is None else state.axis
         moved = replace(fit, across=2 * (axis - usual))
-        flag = self._moved(moved, view.index, f"the opposite frame {one.view.index}", context)
+        flag = self._moved(moved, view.index, f"the opposite frame {earlier.view.index}", context)
         state = state if fit.unsure else replace(state, axis=usual)
         stated = context.axis_col
         shaken = SHAKEN * math.sqrt(fit.places) * context.shake[0] / 2
@@ -199,13 +203,13 @@ class OppositeCheck(Logged):
         if fit.unsure or flag is not None or not first or stated is None or abs(axis - stated) <= limit:
             return CheckResult(state, flag)
         advice = (
-            f"Check the rotation axis: the opposite frames {one.view.index} and {view.index} show it at column "
+            f"Check the rotation axis: the opposite frames {earlier.view.index} and {view.index} show it at column "
             f"{axis:.1f}, but the scan states {stated:.1f}. Either the stated axis is wrong, or the sample moved by "
             "twice the difference."
         )
         return CheckResult(state, Flag(self.name, Level.INFO, view.index, axis - stated, self.axis, advice))
 
-    def _moved(self, fit: ViewFit, row: int, other: str, context: ScanContext) -> Flag | None:
+    def _moved(self, fit: ViewFit, row: int, compared_with: str, context: ScanContext) -> Flag | None:
         assert context.grid is not None
         moved, cell = math.hypot(fit.across, fit.down), context.grid.cell
         # The projections of the first pair, which gave the axis, were also displaced.
@@ -224,28 +228,30 @@ class OppositeCheck(Logged):
             )
         )
         advice = (
-            f"Compare the two frames: relative to {other}, {change}. If `motion` reported a jump, `beamline recon` "
-            "uses only the longer part of the scan. If the sample moved or changed slowly, use `beamline recon "
+            f"Compare the two frames: relative to {compared_with}, {change}. If `motion` reported a jump, `beamline "
+            "recon` uses only the longer part of the scan. If the sample moved or changed slowly, use `beamline recon "
             "--volumes N`, or repeat the scan faster."
         )
         return Flag(self.name, Level.WARN, row, score, limit, advice)
 
 
-def _with_view(kept: tuple[Kept, ...], view: CellView, replaces: int, *, follows: bool) -> tuple[Kept, ...]:
+def _with_view(waiting: tuple[Kept, ...], view: CellView, replaces: int, *, follows: bool) -> tuple[Kept, ...]:
     """The kept projections after one more projection. It either gives the last kept projection its velocity, or is kept
     itself."""
-    kept = tuple(one for one in kept if one.view.index != replaces)  # the replaced view had an alarm
-    if kept and kept[-1].after is None:
-        return (*kept[:-1], replace(kept[-1], after=view)) if follows else kept[:-1]
-    apart = all(abs(_folded(view.angle - one.view.angle)) >= EVERY for one in kept)
-    return (*kept, Kept(view)) if len(kept) < MOST and apart else kept
+    waiting = tuple(earlier for earlier in waiting if earlier.view.index != replaces)  # the replaced view had an alarm
+    if waiting and waiting[-1].after is None:
+        return (*waiting[:-1], replace(waiting[-1], after=view)) if follows else waiting[:-1]
+    apart = all(abs(_folded(view.angle - earlier.view.angle)) >= EVERY for earlier in waiting)
+    return (*waiting, Kept(view)) if len(waiting) < MOST and apart else waiting
 
 
-def _with_nearer(one: Kept, view: CellView) -> Kept:
+def _with_nearer(earlier: Kept, view: CellView) -> Kept:
     """The kept projection, with the given one as the projection that gives its velocity, if the given one is nearer in
     angle than the present one."""
-    before, away = (0.0 if each is None else abs(_folded(each.angle - one.view.angle)) for each in (one.after, view))
-    return replace(one, after=view) if (BESIDE - 1) * before < away < before else one
+    before, away = (
+        0.0 if each is None else abs(_folded(each.angle - earlier.view.angle)) for each in (earlier.after, view)
+    )
+    return replace(earlier, after=view) if (BESIDE - 1) * before < away < before else earlier
 
 
 def _folded(angle: float) -> float:
@@ -253,15 +259,15 @@ def _folded(angle: float) -> float:
     return math.remainder(angle, 2 * math.pi)
 
 
-def lay_on(one: Kept, steps: float, view: CellView, grid: CellGrid, *, mirrored: bool) -> ViewFit | None:
+def lay_on(earlier: Kept, steps: float, view: CellView, grid: CellGrid, *, mirrored: bool) -> ViewFit | None:
     """Best fit of the kept projection to a projection some steps later; None if the later projection has too little
     structure.
 
     Least squares for intensity, shift across and shift down, starting from the best whole number of cells.
     """
-    assert one.after is not None
+    assert earlier.after is not None
     first, last = grid.left, grid.right + 1
-    expected = one.view.depth + np.float32(steps) * (one.after.depth - one.view.depth)
+    expected = earlier.view.depth + np.float32(steps) * (earlier.after.depth - earlier.view.depth)
     if last - first < FEWEST:
         return None
     noise = cell_noise(view.depth[:, first:last], view.weight[:, first:last]) ** 2 * SMOOTHER
@@ -312,11 +318,11 @@ def _nearest(before: Reals, now: Reals) -> int:
     cols = now.shape[1]
     reach = int(SEARCH * cols)
     strips = np.add.reduceat(np.stack([before, now]), np.arange(0, len(now), max(1, len(now) // 16)), axis=1)
-    one, two = strips - strips.mean(axis=(1, 2), keepdims=True)
+    first, two = strips - strips.mean(axis=(1, 2), keepdims=True)
     best, least = 0, math.inf
     for move in range(-reach, reach + 1):
-        a, b = (one[:, : cols - move], two[:, move:]) if move >= 0 else (one[:, -move:], two[:, : cols + move])
-        left = float(np.var(a - b))
-        if left < least:
-            best, least = move, left
+        a, b = (first[:, : cols - move], two[:, move:]) if move >= 0 else (first[:, -move:], two[:, : cols + move])
+        variance = float(np.var(a - b))
+        if variance < least:
+            best, least = move, variance
     return best

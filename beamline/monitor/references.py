@@ -155,7 +155,7 @@ def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames
         intensity = (max(flats) if flats else float(levels.max())) - lowest
         limit = max(LIT * intensity, LIT_SIGMAS * place_noise(base.blocks))
         if (above := levels[levels - lowest > limit] - lowest).size:
-            odd = [same[at] for at in np.flatnonzero(levels - lowest > limit).tolist()]
+            odd = [same[place] for place in np.flatnonzero(levels - lowest > limit).tolist()]
             least_dark = f"the darkest dark, frame {base.row} with {lowest:.6g}"
             yield BadFrames(odd, float(above.max()), limit, (
                 f"these darks were exposed to the beam, or the offset changed: the darks are {range_in_words(above)} "
@@ -179,7 +179,7 @@ def _saturated(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrame
             continue
         if over.any():
             what = f"{most:.2%} of the pixels are saturated (limit {limit:.2%}), so the intensity is not known"
-            odd = [group[at] for at in np.flatnonzero(over).tolist()]
+            odd = [group[place] for place in np.flatnonzero(over).tolist()]
             yield BadFrames(odd, most, limit, f"{what}. Shorten the exposure or add a filter.")
         elif all(flat.constant for flat in group):
             what = f"every pixel is {level(group):g}, although pixels of the darks vary: all pixels are saturated"
@@ -218,7 +218,7 @@ def _beam_lost(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrame
                 f"the beam was lost: these flats have {most:.0%} less intensity than the flats {others} (limit "
                 f"{limit:.0%})."
             )
-            yield BadFrames([group[at] for at in np.flatnonzero(gone > limit).tolist()], most, limit, sentence)
+            yield BadFrames([group[place] for place in np.flatnonzero(gone > limit).tolist()], most, limit, sentence)
 
 
 def _dimmer_than_views(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
@@ -242,13 +242,13 @@ def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
     for group in evidence.of_kind(FLAT):
         intensity = np.stack([(flat.blocks - base) / flat.seconds for flat in group])
         usual = np.median(intensity, axis=0)
-        lit = usual > max(0.0, UNLIT * float(np.nanpercentile(usual, BRIGHT)))
-        if len(group) < 2 or not lit.any():
+        exposed = usual > max(0.0, UNLIT * float(np.nanpercentile(usual, BRIGHT)))
+        if len(group) < 2 or not exposed.any():
             continue
-        ratio = intensity[:, lit] / usual[lit]
+        ratio = intensity[:, exposed] / usual[exposed]
         levels = np.nanmedian(ratio, axis=1)
         local = np.sort(np.nan_to_num(np.abs(ratio / levels[:, None] - 1)), axis=1)
-        places = local[:, max(0, lit.sum() - 1 - max(ZINGERS, round(lit.sum() * WORST)))]
+        places = local[:, max(0, exposed.sum() - 1 - max(ZINGERS, round(exposed.sum() * WORST)))]
         changed, noise = float(np.ptp(levels)), float(np.median(local)) / MEDIAN
         far = np.abs(levels - np.median(levels)) > limit / 2 if changed > limit else np.zeros(levels.size, np.bool_)
         moved = (places > max(limit, CHANGE_SIGMAS * noise)) & ~far

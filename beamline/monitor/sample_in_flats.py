@@ -46,7 +46,7 @@ def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[BadFrames]
     views, groups = evidence.lit_views, evidence.of_kind(FrameKind.FLAT)
     if len(views) < FEWEST:
         return
-    seen, intensity = (
+    projections, intensity = (
         [evidence.intensity(view) for view in views],
         [[evidence.intensity(flat) for flat in each] for each in groups],
     )
@@ -60,13 +60,13 @@ def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[BadFrames]
     else:
         means = [np.mean(own, axis=0) for own in intensity]
         compared = [(list(group), means[i], means[:i] + means[i + 1 :]) for i, group in enumerate(groups)]
-    beside, odd = "other flats of their group" if single else "other flats", list[BadFrames]()
+    compared_with, odd = "other flats of their group" if single else "other flats", list[BadFrames]()
     for frames, image, others in compared:
-        if others and (found := _nearest_view(image, others, seen)) is not None:
-            off, like, nearest = found
+        if others and (nearest_view := _nearest_view(image, others, projections)) is not None:
+            off, like, nearest = nearest_view
             odd.append(BadFrames(frames, off, like / LIKER, (
-                f"the sample was in the beam. In line integral, they differ by {off:.3g} from the {beside}, but only "
-                f"by {like:.2g} from the projection in frame {views[nearest].row}."
+                f"the sample was in the beam. In line integral, they differ by {off:.3g} from the {compared_with}, but "
+                f"only by {like:.2g} from the projection in frame {views[nearest].row}."
             )))  # fmt: skip
     if len(odd) < len(compared):  # otherwise the beam drifts, and each flat is similar to the projections next to it
         yield from odd
@@ -75,9 +75,9 @@ def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[BadFrames]
 def _nearest_view(image: F32, others: Sequence[F32], views: Sequence[F32]) -> tuple[float, float, int] | None:
     """The difference of a flat from the most similar other flat and from the most similar projection, and the number of
     this projection. None if the flat does not show the sample."""
-    lit = lit_places(np.maximum.reduce([image, *others]))
-    off = _beyond_noise(min((log_ratio(image, other, lit) for other in others), key=_spread))
-    like = [_beyond_noise(log_ratio(image, view, lit)) for view in views] if off > 0 else [np.inf]
+    exposed = lit_places(np.maximum.reduce([image, *others]))
+    off = _beyond_noise(min((log_ratio(image, flat, exposed) for flat in others), key=_spread))
+    like = [_beyond_noise(log_ratio(image, view, exposed)) for view in views] if off > 0 else [np.inf]
     nearest = int(np.argmin(like))
     return (off, like[nearest], nearest) if like[nearest] < LIKER * off else None
 
@@ -106,15 +106,17 @@ def _views_above_flats(evidence: Evidence) -> ViewsAboveFlats | None:
         np.asarray(np.mean([evidence.intensity(flat) for flat in group], axis=0), np.float32)
         for group in evidence.of_kind(FrameKind.FLAT)
     ]
-    lit = lit_places(np.maximum.reduce(intensity))
-    if len(views) < FEWEST or not lit.any():
+    exposed = lit_places(np.maximum.reduce(intensity))
+    if len(views) < FEWEST or not exposed.any():
         return None
-    over = [np.percentile([log_ratio(view, each, lit) for view in views], 100 - SHALLOW, axis=0) for each in intensity]
+    over = [
+        np.percentile([log_ratio(view, each, exposed) for view in views], 100 - SHALLOW, axis=0) for each in intensity
+    ]
     brightest = np.percentile(over, WORST, axis=1)
-    columns, n = np.nonzero(lit)[1], max(1, lit.shape[1] // EDGE)
+    columns, n = np.nonzero(exposed)[1], max(1, exposed.shape[1] // EDGE)
     sides = [columns < columns.min() + n, columns > columns.max() - n]
     at_edges = np.min([np.median(np.array(over)[:, side], axis=1) for side in sides], axis=0)
-    changes = [log_ratio(each, intensity[int(np.argmin(brightest))], lit) for each in intensity]
+    changes = [log_ratio(each, intensity[int(np.argmin(brightest))], exposed) for each in intensity]
     mismatch = np.array([np.percentile(np.abs(change - np.median(change)), WORST) for change in changes])
     return ViewsAboveFlats(
         brightest, at_edges, mismatch, max(AIR, SIGMAS * max(place_noise(change) for change in changes))
@@ -178,12 +180,12 @@ def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     turning = depth - mean
     deepest = -np.percentile(turning, SHALLOW, axis=0) - OF_SHALLOW * place_noise(turning)
     masses, least = depth.mean(axis=(1, 2)), float(deepest.mean())
-    seen = float(masses.mean())
-    if np.percentile(deepest, WORST) > DRIFT and LIGHTER * least - seen > SIGMAS * float(masses.std()):
-        yield BadFrames(flats, seen, LIGHTER * least, (
+    typical_mass = float(masses.mean())
+    if np.percentile(deepest, WORST) > DRIFT and LIGHTER * least - typical_mass > SIGMAS * float(masses.std()):
+        yield BadFrames(flats, typical_mass, LIGHTER * least, (
             "the sample was in the beam. The differences between projections show that the sample absorbs at least "
             f"{least:.2g} (line integral, mean over the frame). But the projections divided by these flats show only "
-            f"{seen:.2g} (limit {LIGHTER * least:.2g})."
+            f"{typical_mass:.2g} (limit {LIGHTER * least:.2g})."
         ))  # fmt: skip
 
 
@@ -208,30 +210,30 @@ def _depth_over_air(evidence: Evidence) -> F64 | None:
     Only projections with air at the edges are used. None if there are too few such projections, or too few places.
     """
     intensity = np.mean([evidence.intensity(flat) for flat in evidence.frames(FrameKind.FLAT)], axis=0)
-    lit = lit_places(intensity)
-    rows = np.flatnonzero(2 * lit.sum(axis=1) > lit.shape[1])
-    cols = np.flatnonzero(lit[rows].all(axis=0))
+    exposed = lit_places(intensity)
+    rows = np.flatnonzero(2 * exposed.sum(axis=1) > exposed.shape[1])
+    cols = np.flatnonzero(exposed[rows].all(axis=0))
     views = evidence.lit_views
     if len(views) < FEWEST or not rows.size or cols.size < EDGE:
         return None
     part = np.ix_(rows, cols)
     every = np.ones(intensity[part].shape, np.bool_)
-    seen = (log_ratio(evidence.intensity(view)[part], intensity[part], every).reshape(every.shape) for view in views)
-    depth = -np.stack(list(seen))
+    lines = (log_ratio(evidence.intensity(view)[part], intensity[part], every).reshape(every.shape) for view in views)
+    depth = -np.stack(list(lines))
     n = max(1, cols.size // EDGE)
-    left, right = depth[:, :, :n].mean(axis=2), depth[:, :, -n:].mean(axis=2)
-    air = np.percentile(np.abs(np.concatenate([left, right], axis=1)), WORST, axis=1) < AIR
+    left_edge, right_edge = depth[:, :, :n].mean(axis=2), depth[:, :, -n:].mean(axis=2)
+    air = np.percentile(np.abs(np.concatenate([left_edge, right_edge], axis=1)), WORST, axis=1) < AIR
     along = (np.arange(cols.size) - (n - 1) / 2) / (cols.size - n)
-    depth = depth - (left[..., None] + (right - left)[..., None] * along)
+    depth = depth - (left_edge[..., None] + (right_edge - left_edge)[..., None] * along)
     return np.asarray(depth[air], np.float64) if air.sum() >= FEWEST else None
 
 
-def log_ratio(image: F32, other: F32, lit: Mask) -> F32:
+def log_ratio(image: F32, reference: F32, places: Mask) -> F32:
     """Logarithm of the ratio of two images at places with beam. Values near zero count as a thousandth of the bright
     part."""
-    least = 1e-3 * float(np.percentile(np.maximum(image, other)[lit], BRIGHT)) if lit.any() else 1.0
+    least = 1e-3 * float(np.percentile(np.maximum(image, reference)[places], BRIGHT)) if places.any() else 1.0
     least = max(least, 1e-30)
-    return np.asarray(np.log(np.maximum(image[lit], least) / np.maximum(other[lit], least)), np.float32)
+    return np.asarray(np.log(np.maximum(image[places], least) / np.maximum(reference[places], least)), np.float32)
 
 
 def _spread(values: F32) -> float:

@@ -51,7 +51,7 @@ class CellGrid:
     blocks: int  # side of a cell in preview blocks
     dark: CellValues  # counts [row, col] of the cells without beam; 0 if there was no dark yet
     full: CellValues  # counts above the dark with beam and without sample, at the exposure of the flats
-    lit: CellValues  # float32 [row, col], 1 if a cell gets enough beam, otherwise 0
+    exposed: CellValues  # float32 [row, col], 1 if a cell gets enough beam, otherwise 0
     flats: bool  # False if there are no flats: `full` is then 1, and line integrals are relative
     # row_dark, col_dark: mean dark counts of each preview row and column
     row_dark: CellValues
@@ -99,16 +99,16 @@ def grid_of(
     low, rows, cols = _binned(dark, blocks)
     if flat is None:
         full = np.ones_like(low)
-        lit = full
+        exposed = full
     else:
         full = _binned(flat, blocks)[0] - low
         bright = float(np.percentile(full, BRIGHT))
         hot = low - np.median(low) > HOT * bright
-        lit = ((full > UNLIT * max(bright, 0.0)) & ~hot).astype(np.float32)
-        full = np.where(lit > 0, full, np.float32(1))
-    wide = np.flatnonzero(lit.mean(axis=0) > 0.5)
-    left, right = (int(wide[0]), int(wide[-1])) if wide.size else (0, lit.shape[1] - 1)
-    return CellGrid(blocks * block, blocks, low, full, lit, flat is not None, rows, cols, left, right)
+        exposed = ((full > UNLIT * max(bright, 0.0)) & ~hot).astype(np.float32)
+        full = np.where(exposed > 0, full, np.float32(1))
+    wide = np.flatnonzero(exposed.mean(axis=0) > 0.5)
+    left, right = (int(wide[0]), int(wide[-1])) if wide.size else (0, exposed.shape[1] - 1)
+    return CellGrid(blocks * block, blocks, low, full, exposed, flat is not None, rows, cols, left, right)
 
 
 def view_of(preview: NDArray[np.float32], grid: CellGrid, index: int, angle: float, exposure_ratio: float) -> CellView:
@@ -116,10 +116,10 @@ def view_of(preview: NDArray[np.float32], grid: CellGrid, index: int, angle: flo
     counts, rows, cols = _binned(preview, grid.blocks)
     darkest = np.float32(DARKEST * (1 if grid.flats else 1e3))
     through = np.maximum((counts - grid.dark) / grid.full * np.float32(1.0 / exposure_ratio), darkest)
-    lit = (grid.lit > 0) & ~np.isnan(through)
-    weight = np.where(lit, np.minimum(through, 1), 0)
-    depth = np.where(lit, -np.log(through), 0)
-    gap = ~lit[:, 1:-1] & lit[:, :-2] & lit[:, 2:]
+    exposed = (grid.exposed > 0) & ~np.isnan(through)
+    weight = np.where(exposed, np.minimum(through, 1), 0)
+    depth = np.where(exposed, -np.log(through), 0)
+    gap = ~exposed[:, 1:-1] & exposed[:, :-2] & exposed[:, 2:]
     depth[:, 1:-1][gap] = 0.5 * (depth[:, :-2] + depth[:, 2:])[gap]
     left, right = depth[:, grid.left : grid.left + EDGE], depth[:, grid.right + 1 - EDGE : grid.right + 1]
     edges = float(np.median(left)), float(np.median(right))
@@ -136,23 +136,23 @@ def remaining_intensity(view: CellView, last: CellView | None, grid: CellGrid) -
     if last is None:
         if not grid.flats:
             return 1.0
-        through = view.weight[grid.lit > 0]
+        through = view.weight[grid.exposed > 0]
         return (
             1.0
             if through.size == 0 or np.percentile(through[::3], BRIGHT) >= UNLIT
             else float(np.percentile(through, BRIGHT))
         )
-    seen = last.weight > SEEN
-    if not seen.any():
+    measured = last.weight > SEEN
+    if not measured.any():
         return 1.0
-    return math.exp(float(np.percentile((last.depth - view.depth)[seen][::3], BRIGHT)))
+    return math.exp(float(np.percentile((last.depth - view.depth)[measured][::3], BRIGHT)))
 
 
 def brightest_place(view: CellView, grid: CellGrid) -> float:
     """Mean line integral of the brightest part of the field of view with beam: 0 in air."""
-    depth, lit = view.depth[:, grid.left : grid.right + 1], grid.lit[:, grid.left : grid.right + 1]
+    depth, exposed = view.depth[:, grid.left : grid.right + 1], grid.exposed[:, grid.left : grid.right + 1]
     down, across = (min(parts, n) for parts, n in zip(PLACES, depth.shape, strict=True))
-    sums, cells = (sums_of_places(part, down, across) for part in (depth, lit))
+    sums, cells = (sums_of_places(part, down, across) for part in (depth, exposed))
     means = sums[cells > 0] / cells[cells > 0]
     return float(means.min()) if means.size else 0.0
 
@@ -242,8 +242,11 @@ def _isolated(digest: FrameDigest, before: NDArray[np.float32], dark: float, noi
     rise = digest.peaks - digest.preview
     far = np.flatnonzero(rise * rise > noises**2 * np.maximum(digest.preview - dark, 1))
     rows, cols = np.divmod(far, rise.shape[1])
-    (beside, was), peaks = (_around(image, rows, cols) for image in (digest.preview, before)), digest.peaks[rows, cols]
-    around = np.delete(beside, 4, axis=1).max(axis=1)  # the block itself is left out
+    (neighbours, was), peaks = (
+        (_around(image, rows, cols) for image in (digest.preview, before)),
+        digest.peaks[rows, cols],
+    )
+    around = np.delete(neighbours, 4, axis=1).max(axis=1)  # the block itself is left out
     intensity = np.maximum(around - dark, 1)
     bright = peaks - around > np.maximum(noises * np.sqrt(intensity), RELATIVE * intensity)
     new = was.max(axis=1) - around < 0.5 * (peaks - around)

@@ -54,10 +54,10 @@ class Monitor:
         context: the scan, and the mean references of the latest groups.
         checks: the checks with their limits. states: states of the checks, in their order. kind, counted: kind and
             number of the frames of the latest group. before: digest of the previous frame; None before the first frame.
-            recent: the last projections with beam, oldest first; each is a neighbour in angle of the one before. kept:
-            a projection with beam every few degrees. cut: usual line integral at the worse edge of the field of view,
-            over the projections so far. shake: shaking of the sample, over the projections so far. saturated: fraction
-            of saturated pixels in the last good projection; 1 before the first projection.
+            recent: the last projections with beam, oldest first; each is a neighbour in angle of the one before.
+            spread_views: a projection with beam every few degrees. cut: usual line integral at the worse edge of the
+            field of view, over the projections so far. shake: shaking of the sample, over the projections so far.
+            saturated: fraction of saturated pixels in the last good projection; 1 before the first projection.
     """
 
     context: ScanContext
@@ -67,7 +67,7 @@ class Monitor:
     counted: int = 0
     before: FrameDigest | None = None
     recent: tuple[CellView, ...] = ()
-    kept: tuple[CellView, ...] = ()
+    spread_views: tuple[CellView, ...] = ()
     cut: float = 0.0
     shake: Shake = field(default_factory=Shake)
     saturated: float = 1.0
@@ -97,8 +97,12 @@ class CheckError(Exception):
 
 def without(monitor: Monitor, name: str) -> Monitor:
     """The monitor without the check of this name."""
-    kept = [(check, state) for check, state in zip(monitor.checks, monitor.states, strict=True) if check.name != name]
-    return replace(monitor, checks=tuple(check for check, _ in kept), states=tuple(state for _, state in kept))
+    remaining = [
+        (check, state) for check, state in zip(monitor.checks, monitor.states, strict=True) if check.name != name
+    ]
+    return replace(
+        monitor, checks=tuple(check for check, _ in remaining), states=tuple(state for _, state in remaining)
+    )
 
 
 def look(
@@ -164,7 +168,7 @@ def _without_holes(digest: FrameDigest) -> FrameDigest:
     return replace(digest, preview=preview, peaks=peaks)
 
 
-def _valid(answer: Any, name: str, at: int) -> CheckResult[Any]:
+def _valid(answer: Any, name: str, row: int) -> CheckResult[Any]:
     """The result of a check, after a test that it can be used. Raises TypeError or ValueError if it cannot."""
     if not isinstance(answer, CheckResult) or type(answer.flag) not in (Flag, type(None)):
         raise TypeError(f"the check returned {answer!r:.80}; expected a CheckResult with a Flag or None")
@@ -180,10 +184,10 @@ def _valid(answer: Any, name: str, at: int) -> CheckResult[Any]:
     )
     if not typed or any(len(box) != 4 for box in boxes if box is not None):
         raise TypeError(f"a field of its flag has the wrong type: {flag!r:.300}")
-    if flag.check != name or rows[0] > rows[1] or not 0 <= rows[1] <= at:  # `_from` removes rows that are too early
+    if flag.check != name or rows[0] > rows[1] or not 0 <= rows[1] <= row:  # `_from` removes rows that are too early
         raise ValueError(
             f"its flag names the check {flag.check!r} and rows {rows[0]} to {rows[1]}; expected {name!r} and rows up "
-            f"to {at}"
+            f"to {row}"
         )
     return answer
 
@@ -213,11 +217,11 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
         return replace(monitor, context=replace(context, grid=grid, light_left=remaining_intensity(view, last, grid)))
     follows = math.isnan(steps) or NEAREST < steps < FARTHEST
     if not follows:  # the projection to compare with must be the neighbour in angle
-        recent, last = (), _nearest(view.angle, monitor.kept)
+        recent, last = (), _nearest(view.angle, monitor.spread_views)
         context = replace(context, spots=spots._replace(n=0))
-    left = remaining_intensity(view, last, grid)
-    context = replace(context, grid=grid, light_left=left, follows=follows)
-    if left < DARK or digest.saturated_fraction > monitor.saturated + FLOODED:
+    remaining = remaining_intensity(view, last, grid)
+    context = replace(context, grid=grid, light_left=remaining, follows=follows)
+    if remaining < DARK or digest.saturated_fraction > monitor.saturated + FLOODED:
         return replace(monitor, context=context)  # not used as a measure for later projections
     return _with_good_view(replace(monitor, context=context, saturated=digest.saturated_fraction), view, recent, grid)
 
@@ -228,15 +232,17 @@ def _with_good_view(monitor: Monitor, view: CellView, recent: tuple[CellView, ..
     context = monitor.context
     change = change_of(view, recent, grid)
     view = replace(view, brighter=0.0 if change is None else math.log1p(change.gain))
-    kept = monitor.kept
-    if len(kept) < MOST and math.isfinite(view.angle) and _nearest(view.angle, kept) is None:
-        kept = (*kept, view)
+    spread_views = monitor.spread_views
+    if len(spread_views) < MOST and math.isfinite(view.angle) and _nearest(view.angle, spread_views) is None:
+        spread_views = (*spread_views, view)
     shake = monitor.shake.with_change(change)
     dimmer = dimmer_than_flats(view, grid, context.dimmer)
     context = replace(context, view=view, change=change, dimmer=dimmer, shake=shake.size)
     cut = max(*at_edges(context), FORGET * monitor.cut)
     context = replace(context, truncated=not grid.flats or cut > AIR)
-    return replace(monitor, context=context, recent=(*recent, view)[-SPAN:], kept=kept, cut=cut, shake=shake)
+    return replace(
+        monitor, context=context, recent=(*recent, view)[-SPAN:], spread_views=spread_views, cut=cut, shake=shake
+    )
 
 
 def _of_one_view(apart: float, step: float) -> bool:
@@ -244,10 +250,10 @@ def _of_one_view(apart: float, step: float) -> bool:
     return abs(math.remainder(apart, 2 * math.pi)) < (SAME_ANGLE if math.isnan(step) else SAME * abs(step))
 
 
-def _nearest(angle: float, kept: Sequence[CellView]) -> CellView | None:
+def _nearest(angle: float, spread_views: Sequence[CellView]) -> CellView | None:
     """The projection nearest in angle, if it is within EVERY; otherwise None."""
-    apart = [abs(math.remainder(angle - view.angle, 2 * math.pi)) for view in kept]
-    return kept[int(np.argmin(apart))] if apart and min(apart) < EVERY else None
+    apart = [abs(math.remainder(angle - view.angle, 2 * math.pi)) for view in spread_views]
+    return spread_views[int(np.argmin(apart))] if apart and min(apart) < EVERY else None
 
 
 def _with_reference(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:

@@ -84,15 +84,15 @@ def rotation_axis(
     return axis_col, axis
 
 
-def _compare_with_views(given: float, plan: ScanCorrectionPlan, frames: NDArray[np.int64], warn: Warn) -> None:
+def _compare_with_views(stated_col: float, plan: ScanCorrectionPlan, frames: NDArray[np.int64], warn: Warn) -> None:
     """Warn if some projections clearly show another axis than the axis that the user gave."""
     with suppress(DataError):
-        some = spread(frames, _COMPARED)
-        shown = locate_axis(plan, some, all_there=False)
-        if shown.estimate.confident and abs(shown.col - given) > AGREE * plan.scan.selection.binning:
+        compared_frames = spread(frames, _COMPARED)
+        shown = locate_axis(plan, compared_frames, all_there=False)
+        if shown.estimate.confident and abs(shown.col - stated_col) > AGREE * plan.scan.selection.binning:
             warn(
                 f"Check --axis: the projections show the rotation axis at column {shown.col:.2f}, but "
-                f"{given:g} was given. Columns are counted from 0 at the centre of the first column. "
+                f"{stated_col:g} was given. Columns are counted from 0 at the centre of the first column. "
                 "Unless the sample moved, omit --axis, or compare columns with `beamline sweep FILE "
                 "axis=A:B:STEP`."
             )
@@ -196,12 +196,14 @@ def locate_axis(
     band = apply(plan, frames, slice(start, min(height, start + _AXIS_ROWS)), warn, progress)
     # columns behind slits that were replaced; their noise would strongly affect the axis
     hidden = band.masked.all(axis=0)
-    lit = np.flatnonzero(~hidden | hidden.all())
+    exposed_cols = np.flatnonzero(~hidden | hidden.all())
     angles = source.table.angles[band.view_ids]
     try:
-        estimate = find_axis(np.ascontiguousarray(band.data[..., lit[0] : lit[-1] + 1]), angles)
-        estimate = replace(estimate, value=estimate.value + lit[0], candidates=estimate.candidates + lit[0])
-        if lit.size < band.data.shape[2] and not estimate.confident:
+        estimate = find_axis(np.ascontiguousarray(band.data[..., exposed_cols[0] : exposed_cols[-1] + 1]), angles)
+        estimate = replace(
+            estimate, value=estimate.value + exposed_cols[0], candidates=estimate.candidates + exposed_cols[0]
+        )
+        if exposed_cols.size < band.data.shape[2] and not estimate.confident:
             estimate = find_axis(band.data, angles)
     except ValueError as error:
         raise _not_found(source, error) from error
@@ -223,9 +225,9 @@ def locate_axis(
 
 def _hides_matter(band: Projections) -> bool:
     """True if parts of rows without data were filled with sample material. The position of this material is a guess."""
-    if not band.unmeasured.size or (lit := band.lit) is None:
+    if not band.unmeasured.size or (exposed := band.lit) is None:
         return False
-    return bool(band.data[~lit & lit.any(axis=2, keepdims=True)].sum() > _GUESSED * band.data.sum())
+    return bool(band.data[~exposed & exposed.any(axis=2, keepdims=True)].sum() > _GUESSED * band.data.sum())
 
 
 def _by_unseen_views(band: Projections, angles: NDArray[np.float64]) -> AxisEstimate | None:
@@ -237,11 +239,12 @@ def _by_unseen_views(band: Projections, angles: NDArray[np.float64]) -> AxisEsti
     """
     if band.data.shape[1] < band.data.shape[2] // COLS:
         return None  # otherwise columns would not be binned, and volumes would take minutes
-    dark, some, lit = areas(band.masked), spread(np.arange(angles.size), VIEWS), band.lit
-    data = np.ascontiguousarray(band.data[some])
+    dark, view_numbers, exposed = areas(band.masked), spread(np.arange(angles.size), VIEWS), band.lit
+    data = np.ascontiguousarray(band.data[view_numbers])
     with suppress(ValueError):
         estimate = axis_by_views(
-            data, Geometry.parallel(angles[some], data.shape[1:]), lit=None if lit is None else lit[some]
+            data, Geometry.parallel(angles[view_numbers], data.shape[1:]),
+            lit=None if exposed is None else exposed[view_numbers],
         )  # fmt: skip
         if estimate.confident or dark.any():
             return replace(estimate, confident=not dark.any())

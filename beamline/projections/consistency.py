@@ -128,30 +128,36 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: ScanSelectio
 def _conditions_of(prepared: PreparedProjections, *, whole: bool) -> list[ConsistencyCondition]:
     """The conditions that apply to this scan; `whole`: the data contain all detector rows."""
     geometry, data = prepared.geometry, prepared.seen.data
-    some = spread(np.arange(len(data)), _VIEWS)
+    view_numbers = spread(np.arange(len(data)), _VIEWS)
     edges, frames = reach_of(prepared.seen).edges, prepared.ids
-    wide, (faint, air_is_off) = edges.beyond() or edges.passing(), _faint_or_off(data, some)
+    wide, (faint, air_is_off) = edges.beyond() or edges.passing(), _faint_or_off(data, view_numbers)
     conditions = list[ConsistencyCondition]()
     if geometry.rows_show_slices and not (geometry.is_off_middle and covers_the_circle(geometry.angles)):
         if wide or faint > 1 or air_is_off:
-            conditions = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames[some])]
+            conditions = [
+                _steady(data, view_numbers, geometry.angles[view_numbers], geometry.axis_col, frames[view_numbers])
+            ]
         elif data.shape[1] >= _LEAST_ROWS and whole:
-            conditions = _conditions_within_the_field(prepared, some)
+            conditions = _conditions_within_the_field(prepared, view_numbers)
     if geometry.is_cone and not wide and covers_the_circle(geometry.angles):
-        conditions.append(_lean_of_axis(data, some, geometry))
+        conditions.append(_lean_of_axis(data, view_numbers, geometry))
     if not wide and not air_is_off and covers_the_circle(geometry.angles):
-        conditions.append(_fan(data, some, geometry))
+        conditions.append(_fan(data, view_numbers, geometry))
     if (wide or not air_is_off) and not any(condition.broken for condition in conditions):
         conditions.append(_at_rest(data, geometry, frames, max(faint, 1.0)))
     return conditions
 
 
-def _conditions_within_the_field(prepared: PreparedProjections, some: NDArray[np.intp]) -> list[ConsistencyCondition]:
+def _conditions_within_the_field(
+    prepared: PreparedProjections, view_numbers: NDArray[np.intp]
+) -> list[ConsistencyCondition]:
     """Conditions for parallel projections that show the whole sample, from a subset of the projections."""
     geometry, data = prepared.geometry, prepared.seen.data
-    angles, frames = geometry.angles[some], prepared.ids[some]
-    shown = moments_of((data[view] for view in some), angles, geometry.axis_col)
-    of_mass, of_centre = _noise_of(prepared, [data[view] for view in some[:: max(1, some.size // _COLUMN_VIEWS)]])
+    angles, frames = geometry.angles[view_numbers], prepared.ids[view_numbers]
+    shown = moments_of((data[view] for view in view_numbers), angles, geometry.axis_col)
+    of_mass, of_centre = _noise_of(
+        prepared, [data[view] for view in view_numbers[:: max(1, view_numbers.size // _COLUMN_VIEWS)]]
+    )
     shown = replace(shown, across_sigma=float(np.hypot(shown.across_sigma, of_centre)))
     masses = _masses(shown, angles, frames, of_mass)
     if masses.broken:  # such projections falsify the other moments
@@ -194,7 +200,7 @@ def compare_with_flats(
     return {"air beside the flats": f"{level:+.3f} in line integral (tolerance {WARN:g})"} if air else {}
 
 
-def _faint_or_off(data: F32, some: NDArray[np.intp]) -> tuple[float, bool]:
+def _faint_or_off(data: F32, view_numbers: NDArray[np.intp]) -> tuple[float, bool]:
     """Two facts from the edges: how weakly the sample absorbs, and whether the air is far from zero.
 
     Returns:
@@ -202,8 +208,8 @@ def _faint_or_off(data: F32, some: NDArray[np.intp]) -> tuple[float, bool]:
         unnoticed, because it is corrected as air; the moments are then not valid. (2) True if the edges are far from 0,
         for example because the beam drifts and --air does not correct it. Air then contributes to the moments.
     """
-    edges = np.abs([np.median(data[view][:, [0, -1]]) for view in some])
-    deepest = float(np.median([data[view].max() for view in some]))
+    edges = np.abs([np.median(data[view][:, [0, -1]]) for view in view_numbers])
+    deepest = float(np.median([data[view].max() for view in view_numbers]))
     return _FAINT / max(deepest, 1e-6), float(np.percentile(edges, _MOST_OF_THEM[1])) > _AIR * deepest
 
 
@@ -221,18 +227,18 @@ def _noise_of(prepared: PreparedProjections, views: Sequence[F32]) -> tuple[floa
     pixels = rows * cols + ((rows * cols) ** 2 * np.pi / 2 / sum(air) if air else 0.0)
     slope = rows * cols**2 / 12 * float(np.sqrt(sum(1 / n for n in air))) if len(air) > 1 else 0.0
     # only these are read, because all together may not fit in memory
-    some = views[:: max(1, len(views) // NOISE_VIEWS)][:NOISE_VIEWS]
-    noise = noise_level(np.stack(some)) / mass
+    sampled = views[:: max(1, len(views) // NOISE_VIEWS)][:NOISE_VIEWS]
+    noise = noise_level(np.stack(sampled)) / mass
     return noise * float(np.sqrt(pixels)), noise * slope
 
 
 def _steady(
-    data: F32, some: NDArray[np.intp], angles: F64, axis_col: float, frames: NDArray[np.int64]
+    data: F32, view_numbers: NDArray[np.intp], angles: F64, axis_col: float, frames: NDArray[np.int64]
 ) -> ConsistencyCondition:
     """Projections that are 180° apart must be mirror images. This condition is used if no air shows the intensity."""
     reach = int(min(axis_col, data.shape[2] - 1 - axis_col))
     around = slice(round(axis_col) - reach, round(axis_col) + reach + 1)
-    levels = np.array([np.median(data[view][:, around]) for view in some])
+    levels = np.array([np.median(data[view][:, around]) for view in view_numbers])
     steps = np.diff(levels)
     apart = np.abs(np.abs(angles[:, None] - angles) - np.pi)
     opposite = apart <= 1.01 * float(np.median(np.abs(np.diff(np.sort(angles)))))
@@ -300,11 +306,11 @@ def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: f
     return ConsistencyCondition("mass of the views", float(high - low), tolerance, "of the total absorption", sentence)
 
 
-def _lean_of_axis(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCondition:
+def _lean_of_axis(data: F32, view_numbers: NDArray[np.intp], geometry: Geometry) -> ConsistencyCondition:
     """In a 360° scan the mean projection is its own mirror image about the axis, also in a cone beam."""
-    weights = circle_weights(geometry.angles[some]) / (2 * math.pi)
+    weights = circle_weights(geometry.angles[view_numbers]) / (2 * math.pi)
     mean = np.zeros(data.shape[1:])
-    for view, weight in zip(some, weights, strict=True):
+    for view, weight in zip(view_numbers, weights, strict=True):
         mean += weight * data[view]
     roll, sigma = roll_of_mean_view(mean, geometry.axis_col)
     if math.isnan(sigma):
@@ -318,14 +324,14 @@ def _lean_of_axis(data: F32, some: NDArray[np.intp], geometry: Geometry) -> Cons
     return ConsistencyCondition("mirror images of a turn", abs(roll) * rows, least, "px of tilt", sentence)
 
 
-def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCondition:
+def _fan(data: F32, view_numbers: NDArray[np.intp], geometry: Geometry) -> ConsistencyCondition:
     """Rays measured from both sides in a 360° scan must agree; checked in the rows next to the plane of the source."""
     row = int(np.clip(geometry.axis_row if geometry.is_cone else data.shape[1] / 2, 0, data.shape[1] - 1))
     rows = slice(max(row - _BESIDE_ROW, 0), row + _BESIDE_ROW + 1)
     pitch, across = geometry.pixel_pitch, max(geometry.axis_col, data.shape[2] - 1 - geometry.axis_col)
     stated = pitch / geometry.sdd if geometry.is_cone else 0.0
-    sinogram = data[some][:, rows].mean(axis=1, dtype=np.float64)
-    off, least, usual, best = fans_shown(sinogram, geometry.angles[some], geometry.axis_col, stated)
+    sinogram = data[view_numbers][:, rows].mean(axis=1, dtype=np.float64)
+    off, least, usual, best = fans_shown(sinogram, geometry.angles[view_numbers], geometry.axis_col, stated)
     stated_angle, best_angle = (2 * math.degrees(math.atan(slope * across)) for slope in (stated, best))
     away = f" ({pitch / best:.3g} mm from source to detector)" if geometry.is_cone and best > 0 else ""
     check = (
@@ -349,15 +355,15 @@ def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCo
 
 
 def _across(shown: ViewMoments) -> ConsistencyCondition:
-    left, right = np.percentile(shown.across, _MOST_OF_THEM)
+    lowest, highest = np.percentile(shown.across, _MOST_OF_THEM)
     sentence = (
         f"The sample or the stage moved sideways, or frames have wrong angles: the centre of mass deviates by "
-        f"{right - left:.1f} columns (uncertainty {shown.across_sigma:.2g}) from the sine curve of a "
+        f"{highest - lowest:.1f} columns (uncertainty {shown.across_sigma:.2g}) from the sine curve of a "
         "rotating sample. Use --calibrate shifts or --poses to correct it, or --volumes if the sample "
         "changes."
     )
     tolerance = max(_ACROSS, 2 * _NOISE * shown.across_sigma)
-    return ConsistencyCondition("centre of mass on a sine", float(right - left), tolerance, "columns", sentence)
+    return ConsistencyCondition("centre of mass on a sine", float(highest - lowest), tolerance, "columns", sentence)
 
 
 def _heights(shown: ViewMoments) -> ConsistencyCondition:

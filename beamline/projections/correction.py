@@ -93,8 +93,8 @@ class ScanCorrectionPlan:
     @property
     def done(self) -> dict[str, StepDone]:
         """What each correction step did, by the name of the step."""
-        asked = self.scan.selection.step(Preparation)
-        return {asked.name: asked.done, **self.beam_done, **self.filters.done}
+        preparation = self.scan.selection.step(Preparation)
+        return {preparation.name: preparation.done, **self.beam_done, **self.filters.done}
 
     def of_rows(self, rows: slice | None) -> Plan:
         """The plan for some binned rows, with the margin that filters need. None: for all rows.
@@ -136,14 +136,14 @@ def survey(scan: SelectedScan, views: NDArray[np.int64] = NO_VIEWS) -> ScanCorre
         settings = step.settings(settings) if isinstance(step, CountsStep) else settings
     altered = (altered_sentence(source),) if source.table.altered.any() else ()
     plan = ScanCorrectionPlan(ViewFilters.of(scan), settings, warnings=altered)
-    asked = scan.selection.step(Preparation)
+    preparation = scan.selection.step(Preparation)
     if plan.filters.filters:  # these steps mix pixels, so the likelihood of the counts is no longer known
-        asked = replace(asked, noise="log", gain=None)
+        preparation = replace(preparation, noise="log", gain=None)
     if source.quantity == "counts":
-        plan = _with_references(plan, scan.with_steps(asked))
-    elif asked.noise == "counts":
+        plan = _with_references(plan, scan.with_steps(preparation))
+    elif preparation.noise == "counts":
         raise ConfigError(f"Omit --noise counts: {source.path} contains line integrals, not counts.")
-    elif asked.by_current:
+    elif preparation.by_current:
         current_scale(scan.evidence)  # raises an error if the file has no ring current
     return in_shadow(plan, views) if views.size else plan
 
@@ -152,19 +152,19 @@ def _with_references(plan: ScanCorrectionPlan, scan: SelectedScan) -> ScanCorrec
     """The plan with the darks and flats in the file, and the facts about the beam that they show. `scan` has the noise
     model.
     """
-    read, asked, evidence = plan.filters.read(None), scan.selection.step(Preparation), scan.evidence
-    light = light_scale(evidence, asked.by_current) if asked.by_current or evidence.views_differ else None
+    read, preparation, evidence = plan.filters.read(None), scan.selection.step(Preparation), scan.evidence
+    light = light_scale(evidence, preparation.by_current) if preparation.by_current or evidence.views_differ else None
     references, note = read_references(scan, read)
-    if asked.flat_fields == "dynamic":
+    if preparation.flat_fields == "dynamic":
         references = with_dynamic_flats(scan, references, read)
     _, damaged = damaged_frames(scan, np.concatenate([*evidence.used.darks, *evidence.used.flats]))
     photons = photons_of(scan, references)
-    flats, noise = flats_sentence(evidence, references, asked.by_current), noise_sentence(references, photons)
+    flats, noise = flats_sentence(evidence, references, preparation.by_current), noise_sentence(references, photons)
     recorded = {name: each if isinstance(each, float) else str(each) for name, each in asdict(plan.settings).items()}
     del recorded["sample_from"]  # the line follows from --air
     done = {
         "defects": StepDone(parameters={f"correction_{name}": value for name, value in recorded.items()}),
-        "flats": StepDone(flats, {"flats": flats or asked.flat_fields}),
+        "flats": StepDone(flats, {"flats": flats or preparation.flat_fields}),
         "noise": StepDone(noise, {"noise": noise or "logarithms of counts"}),
     }
     warnings = (*plan.warnings, *([note] if note else []), *damaged, *parts_without_flats(evidence, references))
@@ -233,7 +233,7 @@ def apply(
         DataError: frames cannot be corrected; the message names the file.
     """
     steps = 1 if plan.references is None else _STEPS
-    data, usable = read_usable(plan, frames, rows, warn, lambda n, of: progress(n // steps, of))
+    data, usable = read_usable(plan, frames, rows, warn, lambda n, total: progress(n // steps, total))
     if not (n := usable.size):
         raise no_view(plan.scan.evidence, plan.references)
     with refused(plan):
@@ -266,7 +266,7 @@ def apply_in_batches(
             f"or --bin {2 * plan.scan.selection.binning}."
         )
     in_time, frames = np.sort(frames), frames[by_angle(plan.source.table, frames)]
-    parts, kept = np.split(frames, np.arange(batch, frames.size, batch)), list[Projections]()
+    parts, batches = np.split(frames, np.arange(batch, frames.size, batch)), list[Projections]()
     passes, warn_again = (1, warn) if plan.references is None else (2, None)
 
     def done(parts: int, before: int) -> None:
@@ -281,9 +281,9 @@ def apply_in_batches(
             lines, of_rows = apply_next(plan, *pixels, of_rows, last=n == len(parts))
             if lines is not None:
                 out[np.searchsorted(in_time, lines.view_ids)] = lines.data
-                kept.append(replace(lines, data=np.empty((0, *out.shape[1:]), np.float32)))
+                batches.append(replace(lines, data=np.empty((0, *out.shape[1:]), np.float32)))
                 done(n, passes - 1)
-    ids = np.sort(np.concatenate([part.view_ids for part in kept])) if kept else frames[:0]
+    ids = np.sort(np.concatenate([part.view_ids for part in batches])) if batches else frames[:0]
     if warn is not None and (sentence := unlit_sentence(plan.scan.evidence, in_time, ids)):
         warn(sentence)
     if not ids.size:
@@ -291,8 +291,8 @@ def apply_in_batches(
     for row, place in enumerate(np.searchsorted(in_time, ids)):  # without the projections that are left out
         if row != place:
             out[row] = out[place]
-    masked = np.logical_and.reduce([part.masked for part in kept])
-    merged = merge_and_empty(kept, out[: ids.size])
+    masked = np.logical_and.reduce([part.masked for part in batches])
+    merged = merge_and_empty(batches, out[: ids.size])
     return replace(merged, masked=masked, view_ids=ids, air=merged.air[np.argsort(merged.view_ids)])
 
 
@@ -306,10 +306,10 @@ def _with_air_found(
     """The usable frames of each part, and the plan for counts with the air columns of all parts."""
     usable = []
     for n, part in enumerate(parts, 1):
-        data, some = read_views(plan.filters, plan.references, part, None, warn)
-        if some.size:
-            usable.append(some)
-            counts = counts.surveyed(counts.transmission(data, some.astype(np.float64), some))
+        data, view_ids = read_views(plan.filters, plan.references, part, None, warn)
+        if view_ids.size:
+            usable.append(view_ids)
+            counts = counts.surveyed(counts.transmission(data, view_ids.astype(np.float64), view_ids))
         done(n)
     return usable, replace(counts, settings=replace(counts.settings, air=counts.air_columns), profiles=())
 

@@ -55,9 +55,9 @@ def shadow_on_counts(
         rows = slice(max(0, start - SHADOW_REACH), min(len(in_shadow), start + _BAND + SHADOW_REACH))
         read = slice(first + rows.start * binning, first + rows.stop * binning)
         data = np.nan_to_num(read_binned(source, views, read, binning))
-        light = survey(references.rows(rows), settings).transmission(data, views.astype(np.float64), views).data
-        in_shadow[start : start + _BAND] = shadowed(light, settings.floor)[start - rows.start :][:_BAND]
-        foreign[rows] |= foreign_rows(light, source.table.angles[views])
+        transmission = survey(references.rows(rows), settings).transmission(data, views.astype(np.float64), views).data
+        in_shadow[start : start + _BAND] = shadowed(transmission, settings.floor)[start - rows.start :][:_BAND]
+        foreign[rows] |= foreign_rows(transmission, source.table.angles[views])
     return np.zeros_like(in_shadow) if in_shadow.all() else in_shadow, foreign
 
 
@@ -67,9 +67,11 @@ def shadow_on_lines(source: ScanSource, views: NDArray[np.int64], read: slice, b
     """
     if views.size < SHADOW_VIEWS:
         return None
-    some = spread(views, SHADOW_VIEWS)
-    lines = LinesPlan.of(np.inf).transmission(read_binned(source, some, read, binning), some.astype(np.float64), some)
-    foreign = foreign_rows(np.exp(-lines.data), source.table.angles[some])
+    sampled_views = spread(views, SHADOW_VIEWS)
+    lines = LinesPlan.of(np.inf).transmission(
+        read_binned(source, sampled_views, read, binning), sampled_views.astype(np.float64), sampled_views
+    )
+    foreign = foreign_rows(np.exp(-lines.data), source.table.angles[sampled_views])
     return np.zeros(lines.data.shape[1:], np.bool_), foreign
 
 
@@ -100,11 +102,11 @@ def photons_of(scan: SelectedScan, references: References) -> Photons | None:
         for groups in (scan.evidence.used.flats, scan.evidence.used.darks)
     )
     if model.gain is not None:  # one count of a mean over n pixels stands for n times as many photons
-        light = _counts_of_light(references) * binning**2 / model.gain
+        n_photons = _counts_of_light(references) * binning**2 / model.gain
         low, high = _PHOTONS
-        if not low <= light <= high:
+        if not low <= n_photons <= high:
             raise ConfigError(
-                f"Give --gain in counts per photon, or omit it: --gain {model.gain:g} would mean {light:.3g} "
+                f"Give --gain in counts per photon, or omit it: --gain {model.gain:g} would mean {n_photons:.3g} "
                 f"photons per pixel in the open beam of {source.path}; expected {low:g} to {high:g}."
             )
         variance = float(np.median(darks.var(axis=0, ddof=1))) if len(darks) > 1 else 0.0
@@ -132,16 +134,16 @@ def light_of(references: References, photons: Photons) -> float:
 
 
 def _counts_of_light(references: References) -> float:
-    light = references.flats[0][1] - references.dark
-    return float(np.median(light[lit] if (lit := lit_places(light)).any() else light))
+    intensity = references.flats[0][1] - references.dark
+    return float(np.median(intensity[exposed] if (exposed := lit_places(intensity)).any() else intensity))
 
 
 def noise_sentence(references: References, photons: Photons | None) -> str:
     """A sentence that says how counts are converted to line integrals; empty if they are converted with logarithms."""
     if photons is None:
         return ""
-    light, readout = light_of(references, photons), photons.variance**0.5
+    n_photons, readout = light_of(references, photons), photons.variance**0.5
     return (
-        f"Photon statistics are used (--noise counts): {light:.3g} photons per pixel in the open beam, "
+        f"Photon statistics are used (--noise counts): {n_photons:.3g} photons per pixel in the open beam, "
         f"{photons.gain:.3g} counts per photon, readout noise {readout:.3g} counts"
     )

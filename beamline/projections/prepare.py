@@ -113,7 +113,7 @@ def prepare_projections(
         if any(step.on(scan)[0] is not None for step in estimated):
             # anything unusual in the frames has already been reported
             projections = _corrected(plan, used, buffer, phases)
-    light = compare_with_flats(scan, projections, warn)
+    intensity_laws = compare_with_flats(scan, projections, warn)
     phases.enter("background, rings, held-out projections, hardening", "corrections")
     place = view_geometry.axis_col, axis
     prepared = assemble(scan, projections, geometry, place, usable, warn, buffer is not None)
@@ -125,7 +125,9 @@ def prepare_projections(
             prepared = prepared.with_held_out(held_out, view_geometry.of(held_out.view_ids), room)
     prepared = prepared.stating(done={**plan.done, **tilt, **view_geometry.done})
     prepared = with_reach(scan, _after_scan_steps(scan, prepared, phases))  # the steps changed line integrals
-    prepared = prepared.stating(laws={**light, **warn_of_inconsistency(prepared.centred, scan.selection, warn)})
+    prepared = prepared.stating(
+        laws={**intensity_laws, **warn_of_inconsistency(prepared.centred, scan.selection, warn)}
+    )
     return prepared if buffer is None else _with_unknown_filled(prepared)
 
 
@@ -209,7 +211,7 @@ def _with_unknown_filled(prepared: PreparedProjections) -> PreparedProjections:
     pixels that are `masked` in all projections.
     """
     data, geometry = prepared.seen.data, prepared.geometry
-    seen = seen_rays(geometry, Grid.matching(geometry)) if prepared.leaves_slices else None
+    rays = seen_rays(geometry, Grid.matching(geometry)) if prepared.leaves_slices else None
     for view in range(len(data)):
         weights = np.ones(geometry.detector_shape, np.float32)
         if prepared.sources.measured is not None:
@@ -217,8 +219,8 @@ def _with_unknown_filled(prepared: PreparedProjections) -> PreparedProjections:
         if prepared.sources.shares_of is not None:
             shares = prepared.sources.shares_of(slice(view, view + 1), slice(0, len(weights)))
             weights *= 1 if shares is None else shares[0]
-        if seen is not None:
-            weights *= seen[view]
+        if rays is not None:
+            weights *= rays[view]
         if not weights.all():
             data[view] = masked(data[view : view + 1], weights[None])[0][0]
     return prepared

@@ -162,10 +162,10 @@ class ViewFilters:
         """Apply all filters to the projections, and return the requested rows."""
         if not self.filters or not views.view_ids.size:
             return views
-        read, kept = self._widened(rows)
+        read, inner_rows = self._widened(rows)
         for each in self.filters:
             views = each.apply(views, read.start)
-        return replace(views, data=np.ascontiguousarray(views.data[:, kept]), masked=views.masked[kept])
+        return replace(views, data=np.ascontiguousarray(views.data[:, inner_rows]), masked=views.masked[inner_rows])
 
     def _widened(self, rows: slice | None) -> tuple[slice, slice]:
         """The detector rows to read, and the requested rows among them, in binned rows."""
@@ -212,12 +212,12 @@ def read_views(
                 f"finite pixel and {'is' if dark.size == 1 else 'are'} left out (first: frame {dark[0]})."
             )
         data, frames = data[alive], frames[alive]
-    lit, part = np.ones(len(frames), np.bool_), filters.within(rows)
+    exposed, part = np.ones(len(frames), np.bool_), filters.within(rows)
     beam = None if references is None else (references.dark[part], references.flats[0][1][part])
     for view in np.flatnonzero(scan.light.suspect(data, beam)):
-        lit[view] = not scan.light.unlit(int(frames[view]))
-    if not lit.all():
-        data, frames = data[lit], frames[lit]
+        exposed[view] = not scan.light.unlit(int(frames[view]))
+    if not exposed.all():
+        data, frames = data[exposed], frames[exposed]
     if warn is not None:
         if rows is None and references is not None:
             reported += _copies(scan, data, frames)
@@ -245,14 +245,14 @@ def _copies(scan: ScanEvidence, data: NDArray[Any], frames: NDArray[np.int64]) -
     ]
 
 
-def unlit_sentence(scan: ScanEvidence, asked: NDArray[np.int64], lit: NDArray[np.int64]) -> str:
+def unlit_sentence(scan: ScanEvidence, requested: NDArray[np.int64], exposed: NDArray[np.int64]) -> str:
     """A sentence about requested projections without beam, and the gap in angle that they leave; empty if all
     projections have beam.
     """
-    unlit = np.intersect1d(np.setdiff1d(asked, lit), np.array(scan.light.known_unlit, np.int64))
+    unlit = np.intersect1d(np.setdiff1d(requested, exposed), np.array(scan.light.known_unlit, np.int64))
     if not unlit.size:
         return ""
-    gap = f", and{gap_text}" if (gap_text := gap_sentence(scan.source, asked, lit)) else ""
+    gap = f", and{gap_text}" if (gap_text := gap_sentence(scan.source, requested, exposed)) else ""
     return (
         f"{count(unlit.size, 'projection')} of {scan.source.table.views.size} ({frames_text(unlit)}) had "
         "no beam: the shutter was closed, the beam was lost, or these frames were never written to the "

@@ -75,7 +75,7 @@ class _Reading:
 
     def darks(self, frames: NDArray[np.int64]) -> list[tuple[float, NDArray[np.float64]]]:
         """(exposure in s, mean dark) for each exposure. If exposures are equal or unknown: (NaN, mean of all darks)."""
-        means = [(seconds, self.mean(some)) for seconds, some in by_exposure(self.evidence.table, frames)]
+        means = [(seconds, self.mean(same_exposure)) for seconds, same_exposure in by_exposure(self.evidence.table, frames)]
         return [(seconds, mean) for seconds, mean in means if mean is not None]
 
 
@@ -100,8 +100,8 @@ def read_references(scan: SelectedScan, rows: slice) -> tuple[References, str]:
         mean = reading.mean(group, scale)
         if dark is not None and mean is not None:
             used = np.setdiff1d(group, spoilt_frames(scan.source, reading.use_damaged))
-            own, light = _dark_of(float(np.median(scan.table.exposures[used])), darks), scale[used].mean()
-            net = (1 - light) * dark if own is dark or own is None else dark - light * own
+            own, mean_scale = _dark_of(float(np.median(scan.table.exposures[used])), darks), scale[used].mean()
+            net = (1 - mean_scale) * dark if own is dark or own is None else dark - mean_scale * own
             flats.append((float(used.mean()), (mean + net).astype(np.float32)))
     if dark is None or not flats:
         raise DataError(
@@ -132,9 +132,9 @@ def with_dynamic_flats(scan: SelectedScan, references: References, rows: slice) 
         ConfigError: there are too few flats.
     """
 
-    asked, used = scan.selection.step(Preparation), scan.evidence.used
-    frames = np.setdiff1d(np.concatenate(used.flats), spoilt_frames(scan.source, not asked.uses_flags))
-    scale = light_scale(scan.evidence, asked.by_current)
+    preparation, used = scan.selection.step(Preparation), scan.evidence.used
+    frames = np.setdiff1d(np.concatenate(used.flats), spoilt_frames(scan.source, not preparation.uses_flags))
+    scale = light_scale(scan.evidence, preparation.by_current)
     reading = _Reading.of(scan, rows)
     darks = reading.darks(np.concatenate(used.darks))
 
@@ -143,7 +143,7 @@ def with_dynamic_flats(scan: SelectedScan, references: References, rows: slice) 
             dark = references.dark if len(darks) < 2 else _dark_of(float(scan.table.exposures[frame]), darks)
             yield ((image - dark) * np.float32(scale[frame])).astype(np.float32)
 
-    masked = dead_pixels(references.dark, [flat for _, flat in references.flats], asked.hot_threshold)
+    masked = dead_pixels(references.dark, [flat for _, flat in references.flats], preparation.hot_threshold)
     try:
         dynamic = find_dynamic_flats(flats, np.random.default_rng(scan.selection.seed), masked)
     except ValueError as error:

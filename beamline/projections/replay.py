@@ -156,8 +156,8 @@ def replay(
     """
     monitor, aside = start(context_of(source), checks), SkippedChecks()
     for frame, n in frames_of(source, follow=follow, should_stop=should_stop):
-        seen = digest(frame.counts, monitor.context.saturation, check_block(source.shape))
-        monitor, flags, failures = look_past_failures(monitor, frame, seen)
+        frame_digest = digest(frame.counts, monitor.context.saturation, check_block(source.shape))
+        monitor, flags, failures = look_past_failures(monitor, frame, frame_digest)
         aside = aside.with_frame(monitor.context)
         yield FrameVerdict(frame.index, frame.kind, flags, n, aside, failures)
 

@@ -70,11 +70,11 @@ def statistics_of(
         progress(done, total)
         return measured(source.read([row]))[0]
 
-    return [_of_kind(kind, rows, of, image, source.dtype) for kind, (rows, of) in chosen.items()]
+    return [_of_kind(kind, rows, count, image, source.dtype) for kind, (rows, count) in chosen.items()]
 
 
 def _of_kind(
-    kind: FrameKind, rows: NDArray[np.intp], of: int, image: Callable[[int], NDArray[Any]], dtype: np.dtype[Any]
+    kind: FrameKind, rows: NDArray[np.intp], n_all: int, image: Callable[[int], NDArray[Any]], dtype: np.dtype[Any]
 ) -> KindStatistics:
     """Statistics from two passes over the frames. The first pass finds the range; the second makes the histogram, and
     moments about a value in the range.
@@ -89,7 +89,7 @@ def _of_kind(
     if not finite:
         none = (np.nan,) * len(PERCENT)
         return KindStatistics(
-            kind, rows.size, of, np.nan, np.nan, np.nan, np.nan, none, 0.0, 1.0, np.zeros(2), np.zeros(1, np.int64)
+            kind, rows.size, n_all, np.nan, np.nan, np.nan, np.nan, none, 0.0, 1.0, np.zeros(2), np.zeros(1, np.int64)
         )
     whole_numbers = dtype.kind in "iu" and high - low < 2**20
     edges = (
@@ -112,7 +112,7 @@ def _of_kind(
     middles = (edges[1:] + edges[:-1]) / 2
     full = float(np.iinfo(dtype).max) if dtype.kind in "iu" else np.inf
     return KindStatistics(
-        kind, rows.size, of, low, high, low + mean, float(np.sqrt(max(squares / finite - mean**2, 0.0))),
+        kind, rows.size, n_all, low, high, low + mean, float(np.sqrt(max(squares / finite - mean**2, 0.0))),
         tuple(float(middles[i]) for i in bins), float(pixels[-1] / finite) if high == full else 0.0, 1 - finite / whole,
         edges, pixels, absolute,
     )  # fmt: skip
@@ -189,25 +189,25 @@ class Light:
         return out
 
 
-def light_of(source: ScanSource, statistics: list[KindStatistics], asked: LightAsked) -> Light:
+def light_of(source: ScanSource, statistics: list[KindStatistics], request: LightAsked) -> Light:
     """Intensity and dose of a projection, from the statistics of flats and darks.
 
     Raises:
         ConfigError: as `LightAsked.refuse_impossible`.
     """
-    asked.refuse_impossible(source)
+    request.refuse_impossible(source)
     mean = {each.kind: each.mean for each in statistics}
-    photons = (mean[FrameKind.FLAT] - mean[FrameKind.DARK]) * asked.photons_per_count
+    photons = (mean[FrameKind.FLAT] - mean[FrameKind.DARK]) * request.photons_per_count
     seconds = (source.table.exposures[source.table.of_kind(kind)] for kind in (FrameKind.PROJECTION, FrameKind.FLAT))
     known = [each[np.isfinite(each)] for each in seconds]
     if all(each.size for each in known):  # otherwise all frames are assumed to have the same exposure
         photons *= float(known[0].mean() / known[1].mean())
     photons *= source.frames_per_view
     views = source.table.views.size
-    if asked.material is None:
+    if request.material is None:
         return Light(views, photons)
     return Light(
-        views, photons, _gray(asked.material, source, photons), f"{asked.material} at {source.energy_kev:g} keV"
+        views, photons, _gray(request.material, source, photons), f"{request.material} at {source.energy_kev:g} keV"
     )
 
 

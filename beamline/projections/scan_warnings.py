@@ -64,12 +64,12 @@ def warn_of_the_field(scan: SelectedScan, prepared: PreparedProjections, warn: W
     geometry, edges = prepared.geometry, reach_of(prepared.seen).edges
     unlevelled = not any(prepared.corrected.air_columns)
     if sides := edges.beyond():
-        light = ""
+        air_sentence = ""
         if unlevelled and scan.evidence.in_counts and scan.selection.step(Air).model != "none":
-            light = without_air(scan.evidence, edges.mean)
+            air_sentence = without_air(scan.evidence, edges.mean)
         continued = edges.continued and has_direct_method(geometry)
         wide = not geometry.is_centred.all() or bool(scan.table.offset_views.size)
-        warn(f"{cut_sentence(sides, continued, wide)} {light}".rstrip())
+        warn(f"{cut_sentence(sides, continued, wide)} {air_sentence}".rstrip())
         if unlevelled and (change := uncorrected_current(scan)):
             warn(change)
     elif ranges := edges.passing():
@@ -168,11 +168,14 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
     for share, kind, text in shares:
         if share > 1e-3:
             warn(kind(f"{share:.1%} {text}"))
-    for some, so in (np.setdiff1d(lost, between), "0 in the volume"), (between, "interpolated from their neighbours"):
-        if some.size:
+    for dead_rows, so in (
+        (np.setdiff1d(lost, between), "0 in the volume"),
+        (between, "interpolated from their neighbours"),
+    ):
+        if dead_rows.size:
             warn(
-                f"No data in {count(some.size, what)} of {len(masked)} (counted from 0: "
-                f"{spans(some.tolist())}), because in all projections these detector rows have no beam, zeros, no "
+                f"No data in {count(dead_rows.size, what)} of {len(masked)} (counted from 0: "
+                f"{spans(dead_rows.tolist())}), because in all projections these detector rows have no beam, zeros, no "
                 "finite values, or dead pixels. They are "
                 f"{so if what == 'slice' else 'not used, and voxels that other rows do not show are 0'}."
             )

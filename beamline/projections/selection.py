@@ -98,8 +98,8 @@ class Selection:
         width = width if self.sample_width is None else self.sample_width
         cone, width = self.cone or source.cone, None if width is None else float(width)
         stated = {"pixel_size_mm": size_mm, "cone": cone, "sample_width": width}
-        kept = {each.name: getattr(self, each.name) for each in fields(Selection)}
-        return ScanSelection(**{**kept, **stated}, asked=self, shape=source.shape, path=source.path)
+        own_fields = {each.name: getattr(self, each.name) for each in fields(Selection)}
+        return ScanSelection(**{**own_fields, **stated}, asked=self, shape=source.shape, path=source.path)
 
 
 @dataclass(frozen=True, kw_only=True)

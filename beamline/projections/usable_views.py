@@ -62,13 +62,13 @@ class Regions:
             return None
         height, width = shape
         weights = np.ones((view_ids.size, height, width), np.float32)
-        seen = None if self.resampling is None else self.resampling.places(shape, rows.start)
+        places = None if self.resampling is None else self.resampling.places(shape, rows.start)
         view_of = {int(frame): view for view, frame in enumerate(view_ids)}
         for frame, (top, bottom, left, right), share in zip(
             self.frames[chosen].tolist(), self.boxes[chosen].tolist(), self.shares[chosen].tolist(), strict=True
         ):
-            if seen is not None:
-                row, col = seen
+            if places is not None:
+                row, col = places
                 inside = (row > top - 1) & (row < bottom) & (col > left - 1) & (col < right)
                 weights[view_of[frame]][inside] *= share
                 continue
@@ -161,7 +161,7 @@ def gap_sentence(scan: ScanEvidence | ScanSource, before: NDArray[np.int64], aft
     empty.
     """
     period = np.pi if scan.cone is None else 2 * np.pi
-    narrow, wide = (_widest_gap(scan.table.angles[some], period) for some in (before, after))
+    narrow, wide = (_widest_gap(scan.table.angles[frames], period) for frames in (before, after))
     return f" leave {np.degrees(wide):.3g}° without a projection" if wide >= WIDE * narrow else ""
 
 

@@ -128,9 +128,9 @@ def select(source: ScanSource, selection: Selection) -> SelectedScan:
     Raises:
         ConfigError: as `Selection.of`.
     """
-    asked = selection.step(Preparation)
-    judge = judged_flags if asked.judged and source.finished else None
-    evidence = ScanEvidence(source, EvidenceRequest(asked.accepted, selection.cone, judge))
+    preparation = selection.step(Preparation)
+    judge = judged_flags if preparation.judged and source.finished else None
+    evidence = ScanEvidence(source, EvidenceRequest(preparation.accepted, selection.cone, judge))
     return SelectedScan(evidence, selection.of(source))
 
 
@@ -143,18 +143,18 @@ def checked_views(scan: SelectedScan, warn: Warn) -> UsableViews:
     Raises:
         DataError: the scan cannot be reconstructed; the message lists every reason and what to do about it.
     """
-    selection, asked = scan.selection, scan.selection.step(Preparation)
+    selection, preparation = scan.selection, scan.selection.step(Preparation)
     by_option = {
         "central-column": selection.axis_col,
         "central-row": selection.central_row,
         VARYING: selection.asked.pixel_size_mm if selection.asked.cone is None else selection.asked.cone,
     }
     findings = [hit for hit in findings_of(scan.evidence) if by_option.get(hit.rule) is None]
-    findings = [hit for hit in findings if hit.rule != FLAGS or (asked.uses_flags and hit.severity == "error")]
+    findings = [hit for hit in findings if hit.rule != FLAGS or (preparation.uses_flags and hit.severity == "error")]
     if (poses := stated_poses(scan)) is not None and poses.vectors is not None:
         findings = [finding for finding in findings if finding.rule not in _OF_A_CIRCLE]
     refuse(scan.source, findings)
-    usable = usable_views(scan.evidence, asked.uses_flags)
+    usable = usable_views(scan.evidence, preparation.uses_flags)
     if usable.sentence:
         warn(Note(usable.sentence))
     for finding in findings:

@@ -202,11 +202,11 @@ def _contrast(lines: Lines, first: int, after: int, darker: bool) -> float:
     one side. The outer lines of a band may be only partly in the band.
     """
     left, right = lines[max(first - 1, 0) : first], lines[after : after + 1]
-    beside = [float(side.mean()) for side in (left, right) if side.size]
+    neighbours = [float(side.mean()) for side in (left, right) if side.size]
     own = float(lines[first:after].min() if darker else lines[first:after].max())
-    if not beside:
+    if not neighbours:
         return 0.0
-    return min(beside) - own if darker else own - max(beside)
+    return min(neighbours) - own if darker else own - max(neighbours)
 
 
 def _typical(now: Blocks, before: Blocks) -> float:

@@ -150,12 +150,12 @@ def sharpness(lines: NDArray[Any], dark: CellValues | None, flat: CellValues | N
         scale = np.full_like(low, 1 / max(float(lines.mean(dtype=np.float64)), 1e-9))
     else:
         intensity = flat - low
-        lit = intensity > DARKEST * max(float(intensity.mean()), 0.0)
-        scale = np.divide(1, intensity, out=np.zeros_like(intensity), where=lit)
+        exposed = intensity > DARKEST * max(float(intensity.mean()), 0.0)
+        scale = np.divide(1, intensity, out=np.zeros_like(intensity), where=exposed)
     strip = min(STRIP, len(lines))
     shape, used = (-1, strip, lines.shape[1]), len(lines) // strip * strip
-    seen, lit = ((lines - low) * scale)[:used].reshape(shape), (scale > 0)[:used].reshape(shape)
-    return _ratio(seen, lit), _ratio(seen.swapaxes(1, 2), lit.swapaxes(1, 2))
+    scaled, exposed = ((lines - low) * scale)[:used].reshape(shape), (scale > 0)[:used].reshape(shape)
+    return _ratio(scaled, exposed), _ratio(scaled.swapaxes(1, 2), exposed.swapaxes(1, 2))
 
 
 def _lines(frame: Frame) -> NDArray[Any]:
@@ -190,12 +190,12 @@ def _loss(now: float, usual: FrameScatter) -> float:
     return 1 - now / usual.mean if usual.mean > 0 else 0.0
 
 
-def _ratio(intensity: CellValues, lit: NDArray[np.bool_]) -> float:
+def _ratio(intensity: CellValues, exposed: NDArray[np.bool_]) -> float:
     """Contrast of second differences along the last axis, divided by that of first differences; NaN if there is no
     contrast."""
     n = max(intensity.shape[-1] - FAR, 0)
     first, middle, last = (intensity[..., i : i + n] for i in (0, FAR // 2, FAR))
-    known = lit[..., :-FAR] & lit[..., FAR // 2 : -FAR // 2] & lit[..., FAR:]
+    known = exposed[..., :-FAR] & exposed[..., FAR // 2 : -FAR // 2] & exposed[..., FAR:]
     steps = (known * np.clip(each, -STEEPEST, STEEPEST) for each in (first - 2 * middle + last, last - first))
     near, far = (float(np.vdot(step[:, 1:], step[:, :-1])) for step in steps)
     return near / far if far > 0 else math.nan

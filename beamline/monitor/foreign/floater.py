@@ -189,8 +189,8 @@ def _same(known: SeenCrumb, crumb: SeenCrumb) -> bool:
 def _rows(track: Track) -> tuple[int, int]:
     """First row of cells of the particle, and the row after the last one."""
     rows, cols = track.steps[0].change.shape
-    at = np.clip(np.floor(track.cols + 0.5).astype(int), 0, cols - 1)
-    depth = np.mean([step.change[:, col] for step, col in zip(track.steps, at, strict=True)], axis=0)
+    track_cols = np.clip(np.floor(track.cols + 0.5).astype(int), 0, cols - 1)
+    depth = np.mean([step.change[:, col] for step, col in zip(track.steps, track_cols, strict=True)], axis=0)
     deep = depth > HALF * depth[track.row]
     top = below = track.row
     while top > max(0, track.row - HIGHEST) and deep[top - 1]:

@@ -80,12 +80,12 @@ def covariance(lags: tuple[int, ...], clutter: Clutter) -> Reals:
     power = np.sinc(frequency / (2 * np.pi)) ** 2 / (frequency**2 + ROUGHNESS**2) ** 1.5
     power /= power.sum()
     views, cols = window(lags)
-    later, beside = views[:, None] - views, cols[:, None] - cols
+    later, col_distance = views[:, None] - views, cols[:, None] - cols
     ages, widths = np.unique(np.abs(later)), np.arange(2 * REACH + 1.0)
     # The mean of cos(f (x - v t)) over speeds |v| <= limit is cos(f x) sinc(f limit t).
     blurred = power * np.sinc(frequency * clutter.speed * ages[:, None] / np.pi)
     table = blurred @ np.cos(frequency[:, None] * widths)
-    structure = table[np.searchsorted(ages, np.abs(later)), np.abs(beside).astype(int)]
+    structure = table[np.searchsorted(ages, np.abs(later)), np.abs(col_distance).astype(int)]
     return clutter.structure * structure + CONSTANT + clutter.common * (later == 0) + clutter.noise * np.eye(views.size)
 
 
@@ -175,8 +175,8 @@ class GhostCheck(Logged):
         stride = max(1, min(MOST_STRIDE, round(SWEEP / max(step, 1e-9))))
         radius = COLUMNS / 2 * (WIDER if context.truncated else 1.0)
         if state.filters is None or not abs(radius * step / state.step - 1) < 0.2:
-            made = _designed(radius * step, stride, _noise(state.profiles, stride), self.warn)
-            state = replace(state, filters=made, step=radius * step, usual=None)
+            designed = _designed(radius * step, stride, _noise(state.profiles, stride), self.warn)
+            state = replace(state, filters=designed, step=radius * step, usual=None)
         assert state.filters is not None
         if not state.filters.speeds.size:
             return CheckResult(state)
@@ -224,16 +224,16 @@ class GhostCheck(Logged):
 
 def _profiles(depth: CellValues, weight: CellValues) -> CellValues:
     """Mean line integral [part of the rows, broad column] of the cells with beam."""
-    lit = (weight > 0).astype(np.float32)
-    sums, lit = (sums_of_places(each, min(PARTS, depth.shape[0]), COLUMNS) for each in (depth, lit))
-    return np.asarray(sums / np.maximum(lit, 1), np.float32)
+    exposed = (weight > 0).astype(np.float32)
+    sums, exposed = (sums_of_places(each, min(PARTS, depth.shape[0]), COLUMNS) for each in (depth, exposed))
+    return np.asarray(sums / np.maximum(exposed, 1), np.float32)
 
 
 def _noise(profiles: tuple[CellValues, ...], stride: int) -> float:
     """Noise of a profile, including irregular changes of the sample, from second differences over `stride`
     projections."""
-    seen = np.stack([profile.mean(axis=0) for profile in profiles])
-    second = seen[2 * stride :] - 2 * seen[stride:-stride] + seen[: -2 * stride]
+    profile_means = np.stack([profile.mean(axis=0) for profile in profiles])
+    second = profile_means[2 * stride :] - 2 * profile_means[stride:-stride] + profile_means[: -2 * stride]
     return max(median_deviation(second) / math.sqrt(6.0), LEAST_NOISE)
 
 
@@ -250,9 +250,9 @@ def _designed(rim: float, stride: int, noise: float, limit: float) -> Filters:
                     signals.append(np.cos(0.5 * np.pi * away) ** 2)
                     speeds.append(speed)
     clutter = Clutter(MARGIN * rim * stride, STRUCTURE, COMMON, noise**2)
-    made = filters(LAGS, clutter, np.array(signals).reshape(len(speeds), views.size), np.array(speeds))
-    keep = made.strength * 2 * limit > SHOWS
-    return Filters(made.weights[keep], made.strength[keep], made.speeds[keep])
+    all_filters = filters(LAGS, clutter, np.array(signals).reshape(len(speeds), views.size), np.array(speeds))
+    keep = all_filters.strength * 2 * limit > SHOWS
+    return Filters(all_filters.weights[keep], all_filters.strength[keep], all_filters.speeds[keep])
 
 
 def best_trail(peaks: Sequence[Peak], turn: float) -> Trail | None:
@@ -268,8 +268,8 @@ def best_trail(peaks: Sequence[Peak], turn: float) -> Trail | None:
         age = last.view - first.view
         if age < LEAST - 1:
             break
-        speed, beside = (last.col - first.col) / age, (last.col + first.col - COLUMNS + 1) / 2
-        if abs(speed) < turn * math.sqrt(max((COLUMNS / 2) ** 2 - beside**2, 0.0)) + SLACK:
+        speed, from_middle = (last.col - first.col) / age, (last.col + first.col - COLUMNS + 1) / 2
+        if abs(speed) < turn * math.sqrt(max((COLUMNS / 2) ** 2 - from_middle**2, 0.0)) + SLACK:
             continue
         since = [peak for peak in alike if peak.view >= first.view]
         near = [abs(p.score) for p in since if abs(p.col - (last.col - speed * (last.view - p.view))) <= OFF]

@@ -165,16 +165,16 @@ def _change(before: CellValues, own: CellValues, after: CellValues, weight: Cell
     Changes that whole rows or columns have in common are subtracted from the difference, and the difference is
     smoothed.
     """
-    lit, root, apart = weight > LIT, np.sqrt(weight), before - after
-    change = (own - 0.5 * (before + after)) * lit
-    sample = (change * root).ravel()[::SAMPLED][lit.ravel()[::SAMPLED]]
+    exposed, root, apart = weight > LIT, np.sqrt(weight), before - after
+    change = (own - 0.5 * (before + after)) * exposed
+    sample = (change * root).ravel()[::SAMPLED][exposed.ravel()[::SAMPLED]]
     noise = max(median_deviation(sample) if sample.size else 1.0, LEAST_NOISE)
     # If one neighbour is much brighter than the other, only the darker one is used.
-    change -= 0.5 * np.abs(apart) * (apart * apart * weight > (SPIKE * noise) ** 2) * lit
+    change -= 0.5 * np.abs(apart) * (apart * apart * weight > (SPIKE * noise) ** 2) * exposed
     for axis in (0, 1):
         if change.shape[axis] >= COMMON:
             common = (np.clip(change * root, -OUTLIER * noise, OUTLIER * noise) * root).sum(axis, keepdims=True)
-            change -= common / (weight.sum(axis, keepdims=True) + LIT) * lit
+            change -= common / (weight.sum(axis, keepdims=True) + LIT) * exposed
     change = scipy.ndimage.correlate1d(change, KERNEL, axis=1, mode="constant")
     if len(change) >= KERNEL_ROWS.size:
         change = scipy.ndimage.correlate1d(change, KERNEL_ROWS, axis=0, mode="constant")
@@ -229,9 +229,9 @@ def _seeds(best: CellValues) -> list[tuple[int, int]]:
 def _fastest(steps: CellValues, offsets: NDArray[np.int64], col: int) -> int:
     """Speed of the line that ends in this column and has the largest sum; lines are [speed, step], steps [step,
     col]."""
-    at = col - offsets
-    inside = (at[:, -1] >= 0) & (at[:, -1] < steps.shape[1])
-    sums = steps[np.arange(SEED), at.clip(0, steps.shape[1] - 1)].sum(axis=1)
+    places = col - offsets
+    inside = (places[:, -1] >= 0) & (places[:, -1] < steps.shape[1])
+    sums = steps[np.arange(SEED), places.clip(0, steps.shape[1] - 1)].sum(axis=1)
     return int(np.where(inside, sums, -np.inf).argmax())
 
 
@@ -250,19 +250,19 @@ def _track(octave: Octave, row: int, col: float, speed: float, sample: SampleMot
     if score <= least:
         return None
     cols = np.array([_place(x, v, time, turn, middle) for time in times[: int(n)]])
-    kept = slice(_ended(change, noise, cols), int(n))
-    part = change[kept], noise[kept], times[kept]
-    rival = max(_rival(*part, float(cols[kept][0]), sample.turn, axis, sample.radius) for axis in sample.axes)
-    return Track(score, rival, _uneven(*part[:2], cols[kept]), row, cols[kept], octave.steps[kept])
+    rows = slice(_ended(change, noise, cols), int(n))
+    part = change[rows], noise[rows], times[rows]
+    rival = max(_rival(*part, float(cols[rows][0]), sample.turn, axis, sample.radius) for axis in sample.axes)
+    return Track(score, rival, _uneven(*part[:2], cols[rows]), row, cols[rows], octave.steps[rows])
 
 
 def _ended(change: CellValues, noise: CellValues, cols: NDArray[np.float64]) -> int:
     """Number of newest steps to leave out for the largest score, because the particle has left the field of view.
     More than
     SEED steps remain."""
-    at = np.arange(cols.size), np.clip(np.floor(cols + 0.5).astype(int), 0, change.shape[1] - 1)
-    weight = noise[at].astype(float) ** -2
-    evidence = np.minimum(change[at] / noise[at], CLIP) * np.sqrt(weight)
+    places = np.arange(cols.size), np.clip(np.floor(cols + 0.5).astype(int), 0, change.shape[1] - 1)
+    weight = noise[places].astype(float) ** -2
+    evidence = np.minimum(change[places] / noise[places], CLIP) * np.sqrt(weight)
     scores = evidence[::-1].cumsum()[::-1] / np.sqrt(weight[::-1].cumsum()[::-1])
     return int(np.argmax(scores[: max(cols.size - SEED, 1)]))
 
@@ -270,8 +270,8 @@ def _ended(change: CellValues, noise: CellValues, cols: NDArray[np.float64]) -> 
 def _uneven(change: CellValues, noise: CellValues, cols: NDArray[np.float64]) -> float:
     """Mean square deviation of the changes along a track from their mean, divided by the value expected from noise and
     UNEVEN."""
-    at = np.arange(cols.size), np.clip(np.floor(cols + 0.5).astype(int), 0, change.shape[1] - 1)
-    depth, weight = change[at].astype(float), noise[at].astype(float) ** -2
+    places = np.arange(cols.size), np.clip(np.floor(cols + 0.5).astype(int), 0, change.shape[1] - 1)
+    depth, weight = change[places].astype(float), noise[places].astype(float) ** -2
     mean = float((depth * weight).sum() / weight.sum())
     return float(np.mean((depth - mean) ** 2 / (1 / weight + (UNEVEN * mean) ** 2)))
 
@@ -284,12 +284,12 @@ def _highest(steps, offsets, best):
         best[row] = 0
         for k in range(offsets.shape[0]):
             low, high = max(0, offsets[k, 3]), min(cols, cols + offsets[k, 3])
-            line, one = best[row, low:high], steps[0, row, low:high]
+            line, first = best[row, low:high], steps[0, row, low:high]
             two = steps[1, row, low - offsets[k, 1] : high - offsets[k, 1]]
             three = steps[2, row, low - offsets[k, 2] : high - offsets[k, 2]]
             four = steps[3, row, low - offsets[k, 3] : high - offsets[k, 3]]
             for i in range(high - low):
-                line[i] = max(line[i], (one[i] + two[i]) + (three[i] + four[i]))
+                line[i] = max(line[i], (first[i] + two[i]) + (three[i] + four[i]))
 
 
 @njit(nogil=True, cache=True)

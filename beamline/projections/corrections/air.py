@@ -131,10 +131,12 @@ def background_memory(geometry: Geometry) -> int:
 
     small = geometry.binned(factor_within(geometry.detector_shape, _VOXELS))
     n, pixels, grid = geometry.n_views, math.prod(small.detector_shape), Grid.matching(small)
-    some = min(n, _VIEWS)
+    n_looked_at = min(n, _VIEWS)
     fit = 8 * (_TERMS * pixels + _SUMS * n)
-    volume = 4 * _COPIES * math.prod(grid.shape) + fbp_memory(some, grid.shape[2])
-    return fit + volume + 4 * (4 * some + 3 * min(n, _AT_ONCE)) * pixels + 16 * math.prod(geometry.detector_shape)
+    volume = 4 * _COPIES * math.prod(grid.shape) + fbp_memory(n_looked_at, grid.shape[2])
+    return (
+        fit + volume + 4 * (4 * n_looked_at + 3 * min(n, _AT_ONCE)) * pixels + 16 * math.prod(geometry.detector_shape)
+    )
 
 
 class _Views:
@@ -205,13 +207,13 @@ def without_background(
         )
     if order is None and not fitted.confirmed(noise_level(views.binned(spread(np.arange(len(data)), _NOISE_VIEWS)))):
         return "", None
-    seen = _described(fitted, levelled)
+    description = _described(fitted, levelled)
     # If the line is subtracted and the projections are then brighter than their flats inside the sample's outline, the
     # beam has changed.
     if order is None and fitted.level > 0 and fitted.level + levelled > 0:
         return (
             "The background of the beam was not subtracted, because it is positive and may be weakly "
-            f"absorbing material all around the sample: {seen}. If it is air, give --air "
+            f"absorbing material all around the sample: {description}. If it is air, give --air "
             f"surface:{fitted.order}."
         ), None
     if others is not None:
@@ -221,7 +223,7 @@ def without_background(
             unseen.remove(more.data)
     fitted.remove(data)
     sentence = (
-        f"Background of the beam subtracted: {seen}. The line integral of air was up to "
+        f"Background of the beam subtracted: {description}. The line integral of air was up to "
         f"{fitted.before:.2g} away from zero and is now {fitted.after:.2g}."
     )
     return sentence, fitted.coefficients.mean(axis=0)
@@ -256,7 +258,7 @@ def _fitted(views: _Views, order: int | None) -> tuple[Background | None, tuple[
 
     n, geometry = len(views.data), views.geometry
     numbers = spread(np.arange(n), _VIEWS)
-    some, grid = geometry.select(numbers), Grid.matching(geometry)
+    subset, grid = geometry.select(numbers), Grid.matching(geometry)
     _, y, x = grid.coordinates()
     away = np.hypot(y[:, None], x)
     measured = views.binned(numbers)
@@ -268,7 +270,7 @@ def _fitted(views: _Views, order: int | None) -> tuple[Background | None, tuple[
         inside = away <= geometry.reach - rim * grid.voxel_size
         if not inside.any():  # a detector with a few columns has no voxel inside the sample
             return None, (np.zeros(grid.shape, np.bool_), grid)
-        sample = matter(first_volume(levelled, some, grid).data, inside)
+        sample = matter(first_volume(levelled, subset, grid).data, inside)
         fitted = views.sums(sample, grid, np.arange(n) if last else numbers).fit(order)
         if fitted is None:
             break

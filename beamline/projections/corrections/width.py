@@ -150,8 +150,10 @@ class Width:
         if not (width or any(motion)):
             return geometry, StepDone(parameters=parameters)
         first = (selection.rows or (0, 0))[0] + (selection.binning - 1) / 2
-        seen = replace(geometry, angles=geometry.angles + motion.arc / 2 + motion.skew * first)
-        seen = seen.seen_with(replace(width, arc=abs(motion.arc)), motion.skew * selection.binning)
+        exposed_geometry = replace(geometry, angles=geometry.angles + motion.arc / 2 + motion.skew * first)
+        exposed_geometry = exposed_geometry.seen_with(
+            replace(width, arc=abs(motion.arc)), motion.skew * selection.binning
+        )
         turned = math.degrees(abs(motion.arc)), math.degrees(motion.skew * (rows - 1))
         statements = [
             *([f"each ray has the area of a pixel{f' and a blur of {blur:g} px' if blur else ''}"] if width else []),
@@ -163,7 +165,7 @@ class Width:
         parameters |= {
             "ray_width": self.spread, "exposure_arc_deg": math.degrees(motion.arc), "readout_arc_deg": turned[1],
         }  # fmt: skip
-        return seen, StepDone(f"Ray width in the reconstruction: {', '.join(statements)}.", parameters)
+        return exposed_geometry, StepDone(f"Ray width in the reconstruction: {', '.join(statements)}.", parameters)
 
     def _motion(self, source: ScanSource) -> _Motion | None:
         """The motion that the user or the file states. None: the stage stood still, or the motion is not stated."""

@@ -237,13 +237,13 @@ def fit_curve(views: F32, geometry: Geometry) -> tuple[Curve, float, float]:
             "a fit needs a parallel beam, because only there the total absorption is the same in all "
             "projections. State material and beam instead"
         )
-    some, factor, small = _small(geometry)
-    measured = np.concatenate([bin_views(views[view : view + 1], factor) for view in some])
+    view_numbers, factor, small = _small(geometry)
+    measured = np.concatenate([bin_views(views[view : view + 1], factor) for view in view_numbers])
     grid, highest, now, before = Grid.matching(small), max(float(view.max()) for view in views), measured, math.inf
     for _ in range(_ROUNDS):
         volume = direct(now, small, grid, "hann")
-        air, matter = k_means(volume, 2)
-        paths = project(Volume((volume > (air + matter) / 2).astype(np.float32), grid), small)
+        air, material = k_means(volume, 2)
+        paths = project(Volume((volume > (air + material) / 2).astype(np.float32), grid), small)
         clear = (paths == 0) | (paths > _RIM * grid.voxel_size)
         curve, explained = curve_of_paths(measured[clear], paths[clear], highest)
         corrected = float(np.interp(highest, curve.measured, curve.corrected))
@@ -265,9 +265,9 @@ def fit_curve(views: F32, geometry: Geometry) -> tuple[Curve, float, float]:
 def _small(geometry: Geometry) -> tuple[NDArray[np.int64], int, Geometry]:
     """Projections and a binning that are enough for a curve, and their geometry."""
     n, (rows, cols) = geometry.n_views, geometry.detector_shape
-    some = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).astype(int))
+    view_numbers = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).astype(int))
     factor = max(1, min(round(cols / _COLS), rows))
-    return some, factor, geometry.select(some).binned(factor)
+    return view_numbers, factor, geometry.select(view_numbers).binned(factor)
 
 
 def _unevenness(views: F32) -> float:

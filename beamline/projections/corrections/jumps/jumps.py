@@ -131,11 +131,11 @@ def find_jumps(
             runs[number : number + 1] = [runs[number][runs[number] < best], runs[number][runs[number] >= best]]
         else:
             number += 1
-    kept = max(runs, key=len)
+    usable = max(runs, key=len)
     if real:  # it is not known either to which side these projections belong
-        inner = np.intersect1d(kept, steady)
-        kept = kept[(kept >= inner[0]) & (kept <= inner[-1])]
-    return SampleJumps(kept, _sentence_on_jumps(np.array(sorted(real), np.int64), jumps, frames.size - kept.size))
+        inner = np.intersect1d(usable, steady)
+        usable = usable[(usable >= inner[0]) & (usable <= inner[-1])]
+    return SampleJumps(usable, _sentence_on_jumps(np.array(sorted(real), np.int64), jumps, frames.size - usable.size))
 
 
 def _sentence_on_jumps(real: I64, jumps: I64, lost: int) -> str:
@@ -195,10 +195,10 @@ def _search_memory(scan: SelectedScan) -> int:
     from recon.voxels.displacement import SWEEPS
     from recon.voxels.methods import OsSirtTv
 
-    asked, source = scan.selection.step(Preparation), scan.source
+    preparation, source = scan.selection.step(Preparation), scan.source
     if scan.selection.cone is not None:
         return 0
-    if not (asked.judged or usable_views(scan.evidence, asked.uses_flags).jumps.size):
+    if not (preparation.judged or usable_views(scan.evidence, preparation.uses_flags).jumps.size):
         return 0
     n = min(source.table.views.size, _VIEWS + 2 * _SHORT)
     band = _band(scan)
