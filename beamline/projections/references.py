@@ -75,7 +75,9 @@ class _Reading:
 
     def darks(self, frames: NDArray[np.int64]) -> list[tuple[float, NDArray[np.float64]]]:
         """(exposure in s, mean dark) for each exposure. If exposures are equal or unknown: (NaN, mean of all darks)."""
-        means = [(seconds, self.mean(same_exposure)) for seconds, same_exposure in by_exposure(self.evidence.table, frames)]
+        means = [
+            (seconds, self.mean(same_exposure)) for seconds, same_exposure in by_exposure(self.evidence.table, frames)
+        ]
         return [(seconds, mean) for seconds, mean in means if mean is not None]
 
 
