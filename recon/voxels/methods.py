@@ -79,8 +79,8 @@ class FistaTv(HalfVoxels):
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
 
     def refit(self, share: float) -> VoxelMethod:
-        """The method of the refits for error bars: `EarlyTv` with `share` times its own number of iterations, or times the
-        number of this method if that is smaller.
+        """The method of the refits for error bars: `EarlyTv` with `share` times its own number of iterations, or
+        `share` times `iterations` if that is smaller.
         """
         iterations = max(1, round(share * min(self.iterations, EarlyTv.iterations)))
         return EarlyTv(iterations, self.tv_weight, tv_steps=self.tv_steps, allow_negative=self.allow_negative)
