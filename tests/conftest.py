@@ -24,6 +24,7 @@ import numba
 
 from recon.compiled import LEVELS, level_for, processor_flags
 from recon.compiled.archive import ARCHIVE, PYTHONS, fresh_members, read_sources
+from tests import messages
 from tests.features import folders, table
 
 # How many examples property tests and fuzz run: HYPOTHESIS_PROFILE=thorough pytest tests/drivers -k fuzz
@@ -93,6 +94,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if hasattr(config, "workerinput"):
         seconds = json.loads(_DURATIONS.read_text(encoding="utf-8"))
         items.sort(key=lambda item: -seconds.get(item.nodeid.partition("::")[0], 0.0))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _temporary(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Messages name this folder as TMP."""
+    messages.temporary[0] = str(tmp_path_factory.getbasetemp())
 
 
 _SECONDS: defaultdict[str, float] = defaultdict(float)

@@ -8,6 +8,7 @@ from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import Shutter
 from drivers.in_beam import OutputShutter
 from simulators.devices.clock import VirtualClock
+from tests.messages import refused
 
 
 class Line:
@@ -48,7 +49,7 @@ def test_polarity_and_travel(tells: bool, open_high: bool) -> None:
 
 def test_an_output_that_does_not_hold_is_reported() -> None:
     shutter = OutputShutter(Line(stuck=False), VirtualClock(0.0))
-    with pytest.raises(DeviceError, match=r"output 1 does not have the level.*'high'\. Answered 'low'.*is not known"):
+    with refused(DeviceError):
         shutter.open()
     assert not shutter.is_open()
 
@@ -57,7 +58,7 @@ def test_a_shutter_that_hangs_open_is_never_called_closed() -> None:
     shutter = OutputShutter(Line(stuck=True), VirtualClock(0.0))
     shutter.open()
     for _ in range(2):
-        with pytest.raises(DeviceError, match="closes the shutter"):
+        with refused(DeviceError):
             shutter.close()
         assert shutter.is_open()
 
@@ -67,7 +68,7 @@ def test_after_a_failure_nothing_is_believed() -> None:
     shutter = OutputShutter(line, VirtualClock(0.0), settle=1.0)
     shutter.open()
     line.fails = True
-    with pytest.raises(DeviceError, match=r"box: no reply.*output 1 low.*not known"):
+    with refused(DeviceError):
         shutter.close()
     assert not shutter.is_open()
     line.fails = False

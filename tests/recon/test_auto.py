@@ -24,6 +24,7 @@ from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector
 from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem
+from tests.messages import refused
 
 F32 = NDArray[np.float32]
 VIEWS = recon.Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (40, 32))
@@ -108,7 +109,7 @@ def test_a_method_that_does_not_take_the_views_is_left_out(data: F32) -> None:
             raise ValueError("not these")
 
     assert recon.reconstruct(data, VIEWS, Auto((Refusing(), Scaled()))).settings["factor"] == 1.0
-    with pytest.raises(ValueError, match="fbp: not these"):
+    with refused(ValueError):
         recon.reconstruct(data, VIEWS, Auto((Refusing(),)))
 
 
@@ -225,7 +226,7 @@ def test_progress_counts_the_sweeps_of_trials(data: F32) -> None:
 
 
 def test_views_of_zeros_are_refused() -> None:
-    with pytest.raises(ValueError, match="all projections are zero"):
+    with refused(ValueError):
         recon.reconstruct(np.full((24, 40, 32), np.nan), VIEWS, Auto())
-    with pytest.raises(ValueError, match="all projections are zero"):
+    with refused(ValueError):
         recon.reconstruct(np.zeros((24, 40, 32)), VIEWS, Auto())

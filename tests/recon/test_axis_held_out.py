@@ -14,6 +14,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.prep.align import AxisError
 from recon.voxels.projector import Projector
+from tests.messages import refused
 from tests.recon.bodies import Bodies
 from tests.slow_cases import others_slow
 
@@ -97,7 +98,7 @@ def test_an_axis_beyond_the_search_is_an_error_and_noise_shows_none() -> None:
 
 
 def test_few_views_are_refused() -> None:
-    with pytest.raises(ValueError, match="11 projections"):
+    with refused(ValueError):
         axis_by_views(np.ones((11, ROWS, COLS), np.float32), Geometry.cone(ANGLES[:11], (ROWS, COLS), 1.0, SOD, SDD))
 
 
@@ -107,5 +108,5 @@ def test_views_without_matter_are_refused() -> None:
     for empty in (range(VIEWS), range(1, VIEWS, 3)):
         some = views.copy()
         some[list(empty)] = 0
-        with pytest.raises((AxisError, ValueError), match=r"no material|zero"):
+        with refused((AxisError, ValueError)):
             axis_by_views(some, Geometry.cone(ANGLES, (ROWS, COLS), 1.0, SOD, SDD, axis_col=29.2))

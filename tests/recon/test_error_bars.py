@@ -17,6 +17,7 @@ from recon.base.volume import Grid, Volume
 from recon.error_bars import alternating, error_bars, method_on_voxels
 from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
+from tests.messages import refused
 
 VIEWS = Geometry.parallel(np.linspace(0, np.pi, 96, endpoint=False), (12, 48), pixel_pitch=0.5)
 GRID = Grid.matching(VIEWS)
@@ -88,7 +89,7 @@ def test_a_fit_is_refitted_with_the_weight_of_its_finish() -> None:
     method = recon.R2(steps=5, gaussians=200, finish=2)
     volume, deviation = made(method, problem())
     assert deviation.shape == volume.data.shape and np.isfinite(deviation).all() and deviation.max() > 0
-    with pytest.raises(ValueError, match="voxel refinement"):
+    with refused(ValueError):
         made(replace(method, finish=0), problem())
 
 
@@ -142,8 +143,8 @@ def test_a_stop_leaves_it_out() -> None:
 
 def test_a_method_without_calibration_and_too_few_views_are_refused() -> None:
     given = problem()
-    with pytest.raises(ValueError, match="with calibrated error bars: r2, fbp, fista-tv, pnp-dct"):
+    with refused(ValueError):
         error_bars(recon.Sirt(), given, Volume(ball(), GRID), {}, RunControl())
     less = replace(given, views=given.views.select(np.arange(0, 96, 16)))
-    with pytest.raises(ValueError, match="at least 8 projections"):
+    with refused(ValueError):
         error_bars(recon.Fbp(), less, Volume(ball(), GRID), {}, RunControl())

@@ -15,6 +15,7 @@ from recon.base.kernel import Kernel, RayModel
 from recon.splatting.settings import FitSettings
 from recon.voxels.projector import Projector
 from simulators.samples.bodies.phantom import Phantom
+from tests.messages import refused
 from tests.recon.few_views import GRID, PITCH, SHAPE, VIEWS
 from tests.slow_cases import others_slow
 
@@ -131,13 +132,13 @@ def test_views_that_cannot_be_held_out_are_refused(noisy: np.ndarray, held_out: 
     blank[7] = 0
     with pytest.raises(ValueError, match=message):
         recon.reconstruct(blank, VIEWS, R2(steps=3, gaussians=100), use=DataUse(held_out=held_out))
-    with pytest.raises(ValueError, match=r"whole number.*, got"):
+    with refused(ValueError):
         recon.reconstruct(noisy, VIEWS, R2(steps=3, gaussians=100), use=DataUse(held_out=(2.9,)))  # type: ignore[arg-type]
 
 
 def test_a_checkpoint_of_more_views_is_refused(noisy: np.ndarray) -> None:
     kept = recon.reconstruct(noisy, VIEWS, R2(steps=2, gaussians=100, finish=0)).checkpoint
-    with pytest.raises(ValueError, match=r"least 2\d projections"):
+    with refused(ValueError):
         recon.reconstruct(noisy[:12], VIEWS.select(range(12)), R2(steps=4), control=RunControl(resume=kept))
 
 

@@ -24,6 +24,7 @@ from recon.methods import accepting, build, by_name, names_of_one_volume
 from recon.voxels.beyond_field import whole_reach
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
+from tests.messages import refused
 from tests.recon.few_views import ANGLES, GRID, PITCH, SHAPE, VIEWS
 from tests.refused_calls import refused_calls
 from tests.slow_cases import others_slow
@@ -156,18 +157,18 @@ def test_tilted_views_half_a_turn_apart_are_two_sides(noisy: np.ndarray) -> None
     with pytest.warns(UserWarning, match="is tilted along the beam"):
         made = recon.reconstruct(noisy[[0, 0]], views, R2(steps=2, gaussians=200), grid=GRID)
     assert np.isfinite(made.volume.data).all()
-    with pytest.raises(ValueError, match="from one side"):
+    with refused(ValueError):
         recon.reconstruct(noisy[[0, 0]], views.at([0.3, 0.3 + 2 * np.pi]), grid=GRID)
 
 
 def test_one_view_is_refused(noisy: np.ndarray) -> None:
-    with pytest.raises(ValueError, match="from one side"):
+    with refused(ValueError):
         recon.reconstruct(noisy[:1], VIEWS.select([0]))
 
 
 @pytest.mark.parametrize("method", ["fbp", "fista-tv", recon.Auto()])
 def test_line_integrals_beyond_any_are_refused_with_their_size(noisy: np.ndarray, method: str) -> None:
-    with pytest.raises(ValueError, match=r"One in ten of them is above [\d.]+e\+(19|20)\. At most 1e\+15 is possible"):
+    with refused(ValueError):
         recon.reconstruct(noisy * np.float32(1e20), VIEWS, method)
 
 
@@ -196,7 +197,7 @@ def test_masked_values_are_as_those_that_are_not_finite_or_refused(noisy: np.nda
         lambda: recon.Geometry.parallel(np.ma.array(ANGLES, mask=ANGLES > 1), SHAPE),
         lambda: DataUse(weights=np.ma.array(noisy, mask=hole)),
     ):
-        with pytest.raises(ValueError, match=r"(projections|data|angles|weights) has masked values"):
+        with refused(ValueError):
             call()
     assert model.n_views == 0
 
@@ -359,7 +360,7 @@ def test_views_bring_their_geometry_weights_and_reach(noisy: np.ndarray, monkeyp
     monkeypatch.setattr("recon.voxels.beyond_field.edges_of", None)
     by_views = recon.reconstruct(views, method=method)
     np.testing.assert_array_equal(by_views.volume.data, by_arrays.volume.data)
-    with pytest.raises(ValueError, match=r"leave out geometry and use\.weights, because .* Views"):
+    with refused(ValueError):
         recon.reconstruct(views, VIEWS, method, use=DataUse(weights))
-    with pytest.raises(ValueError, match="give the geometry of the projections"):
+    with refused(ValueError):
         recon.reconstruct(noisy, method=method)

@@ -14,6 +14,7 @@ from beamline import api
 from beamline.config.load import config_folder
 from beamline.storage.readers.open import open_scan
 from tests.beamline.fakes import FakeInstrument, Faults
+from tests.messages import refused
 
 SIMULATED = config_folder() / "simulated.yaml"
 SMALL = {
@@ -118,7 +119,7 @@ def test_in_another_thread_a_request_stops_it_and_no_signal_is_caught(connected:
 
 def test_lost_frames_raise_what_the_command_says_and_leave_the_result(connected: Connected) -> None:
     with connected(FakeInstrument(Faults(lost={9}))) as instrument:
-        with pytest.raises(api.DataError, match="1 of 12 projections is missing"):
+        with refused(api.DataError):
             instrument.scan()
         assert instrument.last is not None
         assert (instrument.last.missing, instrument.last.status, instrument.last.clean) == ((9,), "failed", False)
@@ -151,13 +152,13 @@ def test_a_closed_instrument_and_a_second_scan_at_a_time_are_refused(connected: 
     said: list[str] = []
 
     def another() -> None:
-        with pytest.raises(api.ConfigError, match="still running"):
+        with refused(api.ConfigError):
             instrument.scan(sample="second")
         said.append("refused")
 
     with connected(FakeInstrument(at={3: another})) as instrument:
         assert instrument.scan().clean and said == ["refused"]
-    with pytest.raises(api.ConfigError, match="was closed"):
+    with refused(api.ConfigError):
         instrument.scan()
 
 

@@ -7,6 +7,7 @@ import pytest
 from beamline.config import load as config
 from beamline.core.errors import ConfigError
 from tests.beamline.config_file import GOOD, faults, load, write
+from tests.messages import refused
 
 pytestmark = pytest.mark.usefixtures("simulated_zaber")
 
@@ -60,9 +61,9 @@ def test_what_breaks_one_frame_a_pulse_is_not_for_fly_scans(option: str) -> None
 
 def test_a_level_trigger_exposes_for_the_length_of_the_pulse() -> None:
     path, level = config.config_folder() / "instrument.yaml", "devices.camera.trigger_active=level"
-    with pytest.raises(ConfigError, match=r"scan\.exposure_s \(0\.05\)"):
+    with refused(ConfigError):
         load(path, level)
-    with pytest.raises(ConfigError, match=r"pulse_width_s \(now 0\.001\)"):
+    with refused(ConfigError):
         load(path, level, "devices.stage.pulse_width_s=0.001")
     zaber = "{kind: zaber, port: COM3, counts_per_turn: 384000, max_speed_deg_s: 30, acceleration_deg_s2: 60}"
     load(path, level, f"devices.stage={zaber}", "devices.stage.pulse_width_s=0.05")

@@ -14,6 +14,7 @@ from beamline.core.errors import ConfigError
 from beamline.plan.passes import Choice
 from beamline.plan.plan import Mode, Place
 from tests.beamline.config_file import CONFIGS, GOOD, faults, load, write
+from tests.messages import refused
 
 
 @pytest.mark.parametrize("name", CONFIGS)
@@ -172,9 +173,9 @@ def test_several_frames_a_view_are_of_a_step_scan_that_takes_none_again(tmp_path
     plan = plan_of(load(path, "scan.mode=step", "scan.frames_per_view=3"))
     assert (plan.n_views, plan.angles.size) == (12, 36)
     np.testing.assert_array_equal(plan.angles.reshape(12, 3).T, [plan.angles[::3]] * 3)
-    with pytest.raises(ConfigError, match=r"scan\.mode"):
+    with refused(ConfigError):
         load(path, "scan.frames_per_view=3")
-    with pytest.raises(ConfigError, match=r"monitor\.retake"):
+    with refused(ConfigError):
         load(path, "scan.mode=step", "scan.frames_per_view=3", "monitor.retake=true")
 
 

@@ -22,6 +22,7 @@ from drivers.in_beam import ManualSampleMover, ManualShutter
 from drivers.orca_quest import DcamOptions
 from tests.beamline.ball_scan import STAGES, shipped, small
 from tests.beamline.closable import Closable
+from tests.messages import refused
 
 pytestmark = pytest.mark.usefixtures("simulated_zaber")
 
@@ -78,7 +79,7 @@ def test_settings_that_a_device_would_refuse() -> None:
         }
     )
     for call in (devices.describe, devices.connect):
-        with pytest.raises(ConfigError, match=r"simulation\.scene: "):
+        with refused(ConfigError):
             call(wrong)
 
 
@@ -86,7 +87,7 @@ def test_instrument_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     """The stage is freed where the camera does not open; shutter and sample are the operator's."""
     stage, made = Closable(), []
     monkeypatch.setattr(StageSection, "connect", lambda *args: stage)
-    with pytest.raises(DeviceError, match="camera"):
+    with refused(DeviceError):
         devices.connect(shipped("instrument", "devices.camera.library=/nowhere/libdcamapi.so"))
     assert stage.closed == 1
 

@@ -10,6 +10,7 @@ from beamline.instrument import connect as devices
 from beamline.scan.dry_run import dry_run
 from drivers.base.errors import DeviceRefused
 from tests.beamline.ball_scan import COMMON, STAGES, small
+from tests.messages import refused
 
 pytestmark = pytest.mark.usefixtures("simulated_zaber")
 
@@ -24,7 +25,7 @@ def test_a_shutter_never_sits_on_the_trigger_output(kind: str) -> None:
     ):
         instrument.devices.stage.digital_output(taken)
     pm16c = small()
-    with devices.connect(pm16c) as instrument, pytest.raises(DeviceRefused, match="no digital output 1"):
+    with devices.connect(pm16c) as instrument, refused(DeviceRefused):
         instrument.devices.stage.digital_output(1)
 
 
@@ -45,19 +46,19 @@ CLOSE = {
 }
 
 
-@pytest.mark.parametrize(("stage", "refused"), CLOSE.values(), ids=CLOSE)
-def test_a_dry_run_refuses_the_pulses_that_the_stage_would_refuse(stage: str, refused: set[int]) -> None:
+@pytest.mark.parametrize(("stage", "rejected"), CLOSE.values(), ids=CLOSE)
+def test_a_dry_run_refuses_the_pulses_that_the_stage_would_refuse(stage: str, rejected: set[int]) -> None:
     """2951, 3000 and 3051 views over half a turn are 61, 60 and 59 counts apart; at full speed 60 take 2 ms."""
     for views, counts in ((2951, 61), (3000, 60), (3051, 59)):
         settings = small(f"devices.stage={{{stage}, {COMMON}}}", f"scan.angles={{scheme: fixed, views: {views}}}")
         worked = dry_run(settings)
         assert worked.timeline.step_counts == counts
-        assert any("trigger output" in said for said in worked.timeline.violations) == (views in refused)
+        assert any("trigger output" in said for said in worked.timeline.violations) == (views in rejected)
         with devices.connect(settings) as instrument:
             assert instrument.devices.stage.limits == worked.stage
             instrument.devices.stage.start_move(math.radians(-2), math.radians(10))
             instrument.devices.stage.wait(10.0)
-            expected = pytest.raises(DeviceRefused, match="cannot be emitted") if views in refused else nullcontext()
+            expected = refused(DeviceRefused) if views in rejected else nullcontext()
             with expected:
                 instrument.devices.stage.arm(worked.timeline.views.trains[0])
 

@@ -22,6 +22,7 @@ from beamline.core.flag import Flag, Level
 from beamline.page.followed_run import RunValues, Severity, Stamp, StampedValues, choice_of
 from beamline.plan.passes import Choice
 from tests.beamline.pass_options import UNKNOWN, option
+from tests.messages import refused
 
 STARTED = RunStarted(Path("runs/a"), Path("runs/a/scan.h5"), "cathode", 20, 60.0, 1000, [])
 FRAME = FrameStored(5, 20, "projection", 2.5, 40.0, 6.0, 812.0)
@@ -91,11 +92,11 @@ def test_what_can_be_measured_next_stands_in_lists_until_it_is_chosen() -> None:
 
 def test_a_choice_is_one_of_the_options() -> None:
     assert choice_of(_after(STARTED, ASKED), "enough") is Choice.ENOUGH
-    with pytest.raises(ConfigError, match="'offset' cannot be chosen now; possible: next, enough"):
+    with refused(ConfigError):
         choice_of(_after(STARTED, ASKED), "offset")
-    with pytest.raises(ConfigError, match="no pass has ended yet"):
+    with refused(ConfigError):
         choice_of(_after(STARTED), "next")
-    with pytest.raises(ConfigError, match="cannot be chosen now"):  # of a log of another version
+    with refused(ConfigError):  # of a log of another version
         choice_of(_after(STARTED, replace(ASKED, options=[{**NEXT, "choice": "later"}])), "later")
 
 

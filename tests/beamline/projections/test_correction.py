@@ -21,6 +21,7 @@ from beamline.storage.rules.light import references_usable
 from tests.beamline.array_source import ArraySource, counted, scan_of
 from tests.beamline.prepared_views import feed_batches
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
+from tests.messages import refused
 from tests.slow_cases import others_slow
 
 SCAN = TwoCylinders()
@@ -114,7 +115,7 @@ def test_dynamic_flats_of_a_beam_that_moves(rng: np.random.Generator) -> None:
     assert errors[1] < 0.3 * errors[0]
     assert "principal components of the flats" in plan.done["flats"].sentence
     few = scan_of(data[:1], data[1:4], data[13:], SCAN.angles, np.float32)
-    with pytest.raises(ConfigError, match="--flat-fields"):
+    with refused(ConfigError):
         plan_of(few, Selection(steps=(Preparation(flat_fields="dynamic"),)))
 
 
@@ -125,7 +126,7 @@ def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
     data = DARK + light * np.nan_to_num(current)[:, None, None] / 180
     source = scan_of(data[:1], data[1:3], data[3:], SCAN.angles, np.float32)
     used = PLAIN.with_steps(Preparation(ring_current="use"))
-    with pytest.raises(ConfigError, match="no ring current"):
+    with refused(ConfigError):
         plan_of(source, used)
     source.state(currents=current)
     off = []
@@ -139,7 +140,7 @@ def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
     )
     current[2] = np.nan
     source.state(currents=current)
-    with pytest.raises(ConfigError, match="projections or flats"):
+    with refused(ConfigError):
         plan_of(source, used)
 
 

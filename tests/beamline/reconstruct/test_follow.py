@@ -39,6 +39,7 @@ from tests.beamline.reconstruct.growing_scan import (
     schedule,
 )
 from tests.beamline.scans import frames_of
+from tests.messages import refused
 from tests.slow_cases import others_slow
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -219,7 +220,7 @@ def test_what_cannot_be_followed_is_refused_at_once(tmp_path: Path, changes: dic
 
 def test_an_existing_result_stays(tmp_path: Path) -> None:
     (tmp_path / "recon.h5").write_text("precious")
-    with pytest.raises(DataError, match="never overwritten"):
+    with refused(DataError):
         reconstruct_file(options(tmp_path), lambda event: None, ScanClock())
     assert (tmp_path / "recon.h5").read_text() == "precious"
 
@@ -273,7 +274,7 @@ def test_without_a_projection_there_is_no_last_fit(tmp_path: Path) -> None:
     with follower.source:
         clock.sleep(40.0)
         follower.source.refresh()  # past the follower
-        with pytest.raises(DataError, match="taken none of the 30 projections"):
+        with refused(DataError):
             follower.end()
     close(clock)
 

@@ -13,6 +13,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.reconstruct.truth import fit_truth, measured_file, read_truth
 from recon.assess.metrics import ssim_of_whole_slices
 from recon.base.volume import Grid
+from tests.messages import refused
 
 DATA = np.arange(4 * 6 * 8, dtype=np.float32).reshape(4, 6, 8)
 
@@ -43,12 +44,12 @@ def test_truths_that_are_none(tmp_path: Path) -> None:
     for name in ("two.npz", "flat.npz", "text.npz", "other.h5", "objects.npy"):
         with pytest.raises(DataError, match="readable volume"):
             read_truth(str(tmp_path / name))
-    with pytest.raises(DataError, match="neither"):
+    with refused(DataError):
         read_truth(str(tmp_path / "text.npz"))
     np.save(tmp_path / "good.npy", DATA)
-    with pytest.raises(ConfigError, match=r"slices 2:9 are outside"):
+    with refused(ConfigError):
         read_truth(f"{tmp_path / 'good.npy'}:2:9")
-    with pytest.raises(ConfigError, match=r"missing\.npy"):
+    with refused(ConfigError):
         read_truth(str(tmp_path / "missing.npy"))
 
 
@@ -60,13 +61,13 @@ def test_a_finer_truth_is_averaged_onto_the_grid() -> None:
         block = DATA[2 * z : 2 * z + 2, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2]
         assert fitted.data[z, y, x] == pytest.approx(block.mean())
     np.testing.assert_array_equal(fit_truth(DATA, Grid(DATA.shape), 1).data, DATA)
-    with pytest.raises(ConfigError, match=r"shape \(4, 6, 8\), but the volume has \(4, 6, 9\)"):
+    with refused(ConfigError):
         fit_truth(DATA, Grid((4, 6, 9)), 1)
 
 
 def test_a_constant_truth_is_refused() -> None:
     for value in (1.0, np.nan):
-        with pytest.raises(ConfigError, match="cannot be used for a comparison"):
+        with refused(ConfigError):
             fit_truth(np.full((4, 8, 8), value, np.float32), Grid((4, 8, 8)), 1)
 
 
@@ -85,7 +86,7 @@ def test_a_volume_file_is_measured_by_masks_that_somebody_drew(tmp_path: Path, r
     }
     for wrong, said in {"3": labels + 2, "shape": labels[:3]}.items():
         tifffile.imwrite(tmp_path / f"{wrong}.tif", said, photometric="minisblack")
-        with pytest.raises(DataError, match="cannot be measured"):
+        with refused(DataError):
             measured_file(tmp_path / "v.npy", None, tmp_path / f"{wrong}.tif")
 
 
@@ -96,5 +97,5 @@ def test_a_volume_file_is_measured_against_a_truth(tmp_path: Path, rng: np.rando
     found = measured_file(tmp_path / "v.npy", str(tmp_path / "t.npy"), None)
     assert set(found) == {"psnr", "nrmse", "ssim3d", "ssim_slices"}
     assert found["ssim_slices"] == pytest.approx(ssim_of_whole_slices(truth, truth / 2))
-    with pytest.raises(DataError, match="cannot be measured"):
+    with refused(DataError):
         measured_file(tmp_path / "v.npy", f"{tmp_path / 't.npy'}:0:7", None)

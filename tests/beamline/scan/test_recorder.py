@@ -28,6 +28,7 @@ from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import Ran
+from tests.messages import refused
 
 TIMELINE = FakeInstrument().timeline()
 
@@ -96,7 +97,7 @@ def test_a_failure_reaches_whoever_waits_for_room_and_nothing_is_written_after_i
                 go.set()
             recorder.put(frame(row))
     assert isinstance(caught.value.__cause__, OSError)
-    with pytest.raises(DataError, match="No space left"):
+    with refused(DataError):
         recorder.finish()
     assert writer.rows == list(range(at))
 
@@ -108,7 +109,7 @@ def test_frames_before_one_that_cannot_be_digested_are_written() -> None:
         recorder.put(frame(row))
     recorder.put(replace(frame(3), counts=np.zeros((2, 2, 2), np.uint16)))
     slow.set()
-    with pytest.raises(DataError, match=r"not uint16 \(2, 2, 2\).*first 3 frames"):
+    with refused(DataError):
         recorder.finish()
     assert writer.rows == [0, 1, 2]
 

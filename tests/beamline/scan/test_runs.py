@@ -20,6 +20,7 @@ from beamline.storage import writer_lock
 from beamline.storage.run_record import RecordFile, RunRecord, read_record, write_record
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran, ended_run, small
+from tests.messages import refused
 
 FRAMES = 3 + 2 + 12 + 2  # darks, flats, views, flats of the configuration `small`
 
@@ -91,7 +92,7 @@ def test_newest_first_also_within_a_second(tmp_path: Path) -> None:
     (tmp_path / "no run").mkdir()
     assert runs_in(tmp_path) == [*reversed(runs), renamed]
     assert newest(tmp_path) == runs[-1]
-    with pytest.raises(ConfigError, match="no run"):
+    with refused(ConfigError):
         newest(tmp_path / "no run")
 
 
@@ -172,10 +173,10 @@ def test_of_a_kill_before_the_first_frame_nothing_that_refuses_is_advised(tmp_pa
         died = describe(run)
         assert (died.state, died.frames) == ("died", 0)
         assert died.next_step == "The run ended before its first frame: start the scan again."
-    with pytest.raises(DataError, match=r"has no frame: .*Nothing was changed"):
+    with refused(DataError):
         recover_run(run)
     (run / "config.resolved.yaml").write_text(resolved_yaml(small()))
-    with pytest.raises(NoFrame, match="start the scan again"), open_for_resume(run):
+    with refused(NoFrame), open_for_resume(run):
         pass
 
 

@@ -19,6 +19,7 @@ from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame
 from tests.beamline.storage.conftest import INFO, SHAPE, append, scan_frames
 from tests.clock import SteppedClock
+from tests.messages import refused
 
 
 def test_followers_see_frames_when_they_are_flushed(tmp_path: Path, clock: SteppedClock, frames: list[Frame]) -> None:
@@ -31,7 +32,7 @@ def test_followers_see_frames_when_they_are_flushed(tmp_path: Path, clock: Stepp
         assert seen == [0, 0, 3, 3, 3, 6, 6, 6]
         assert writer.committed == 6
         assert not source.finished
-        with pytest.raises(IndexError, match=r"only 0\.\.5"):
+        with refused(IndexError):
             source.read([6])
         np.testing.assert_array_equal(source.read(slice(None)), [frame.counts for frame in frames[:6]])
         np.testing.assert_array_equal(source.table.kinds, [2, 2, 1, 1, 1, 0])
@@ -107,7 +108,7 @@ def test_a_file_that_is_cut_off_is_refused_at_once(
             (tmp_path / "cut.h5").write_bytes((tmp_path / "s.h5").read_bytes()[:-missing])
     if closed:
         (tmp_path / "cut.h5").write_bytes((tmp_path / "s.h5").read_bytes()[:-missing])
-    with pytest.raises(DataError, match=r"cut\.h5"):
+    with refused(DataError):
         open_scan(tmp_path / "cut.h5")
-    with pytest.raises(NotReadyError, match=r"cut\.h5"):
+    with refused(NotReadyError):
         open_scan(tmp_path / "cut.h5", follow=True)

@@ -21,6 +21,7 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.readers.reference_files import load_images
 from beamline.storage.volume_file import read_volume
 from drivers.base.frame import Frame, FrameKind
+from tests.messages import refused
 
 PIPES = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
 
@@ -44,7 +45,7 @@ def test_a_scan_that_draws_on_a_pipe(tmp_path: Path, path: Path, draw: Callable[
         draw(file, "pipe")
     open_scan(path).close()
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(DataError, match=r"has a link to .*or a pipe"):
+    with refused(DataError):
         open_scan(path)
 
 
@@ -81,7 +82,7 @@ def test_a_file_whose_root_group_is_damaged_is_an_error_of_the_data(path: Path) 
     content = bytearray(path.read_bytes())
     content[content.index(b"OHDR") + 20] ^= 1
     path.write_bytes(content)
-    with pytest.raises(DataError, match=r"damaged|cannot be read as HDF5"):
+    with refused(DataError):
         open_hdf5(path)
 
 
@@ -119,7 +120,7 @@ def test_a_percent_sign_in_the_name_of_a_source(tmp_path: Path) -> None:
     with open_hdf5(tmp_path / "whole.h5") as file:
         assert datasets.missing_links(file["data"]) == [] and file["data"][()].all()
         assert datasets.missing_links(file["lost"]) == [str(tmp_path / "gone_%.h5")]
-    with pytest.raises(DataError, match="numbered series"):
+    with refused(DataError):
         structure.plain_name("part_%b.h5")
 
 
@@ -131,8 +132,8 @@ def test_a_pipe_in_a_folder_or_by_its_name(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="a device or a pipe"):
         read_volume(tmp_path)
     for read in (read_volume, open_hdf5):
-        with pytest.raises(DataError, match="a device or a pipe"):
+        with refused(DataError):
             read(tmp_path / "p_003.tif")
     for place in (tmp_path, tmp_path / "p_003.tif"):
-        with pytest.raises(DataError, match="a device or a pipe"):
+        with refused(DataError):
             load_images(place, FrameKind.DARK, (8, 8))

@@ -16,6 +16,7 @@ from PIL import Image
 
 from beamline.core.errors import DataError
 from beamline.storage.volume_file import read_volume
+from tests.messages import refused
 
 VALUES = np.arange(24, dtype=np.int16).reshape(2, 3, 4) - 5
 
@@ -72,7 +73,7 @@ def test_nifti_scales_values_and_lengths_as_its_header_says(tmp_path: Path) -> N
 def test_without_nibabel_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "v.nii").write_bytes(nifti())
     monkeypatch.setitem(sys.modules, "nibabel", None)
-    with pytest.raises(DataError, match=r"pip install splatline\[nifti\]"):
+    with refused(DataError):
         read_volume(tmp_path / "v.nii")
 
 
@@ -164,7 +165,7 @@ def test_slices_of_other_programs_are_a_volume_without_the_preview_beside_them(t
     assert read_volume(tmp_path)[1] is None
     for z in range(2):
         Image.fromarray(slices[z]).save(tmp_path / f"other_{z}.{suffix}")
-    with pytest.raises(DataError, match=r"several series of images: 11 such as rec_0.*2 of other_#"):
+    with refused(DataError):
         read_volume(tmp_path)
 
 
@@ -174,7 +175,7 @@ def test_coloured_pictures_are_no_volume(tmp_path: Path) -> None:
     assert read_volume(tmp_path)[0].tolist() == [[[90] * 5] * 4]
     grey[1, 1, 0] = 200
     Image.fromarray(grey).save(tmp_path / "s_1.png")
-    with pytest.raises(DataError, match="it has colours"):
+    with refused(DataError):
         read_volume(tmp_path)
 
 

@@ -9,6 +9,7 @@ from drivers.base.protocols import BeamMonitor
 from drivers.beam_monitors import TextBeamMonitor
 from drivers.epics.devices import PvSource
 from tests.drivers.soft_ioc import PREFIX, TickingClock, Variables, serve_pva
+from tests.messages import refused
 
 pytest.importorskip("p4p")
 URL = f"pva://{PREFIX}"
@@ -22,12 +23,12 @@ def test_the_ring_current(monkeypatch: pytest.MonkeyPatch) -> None:
         assert (reading.value, reading.unit, reading.time) == (pytest.approx(0.1994), "A", clock.now())
         served.values["ring"] = float("nan")
         clock.sleep(1)
-        with pytest.raises(DeviceError, match="no number"):
+        with refused(DeviceError):
             monitor.reading()
         served.values["ring"], served.severity = 1e-30, 3
         clock.sleep(1)
-        with pytest.raises(DeviceError, match="INVALID"):
+        with refused(DeviceError):
             monitor.reading()
         monitor.close()
-        with pytest.raises(DeviceError, match="closed"):
+        with refused(DeviceError):
             monitor.reading()

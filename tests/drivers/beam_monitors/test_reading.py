@@ -22,6 +22,7 @@ from drivers.beam_monitors import PATTERN, ElectrometerQuery, PageSource, Serial
 from simulators.devices.clock import VirtualClock
 from simulators.wires.electrometer import ElectrometerWire
 from simulators.wires.wire import register
+from tests.messages import refused
 from tests.refused_calls import refused_calls
 
 RING = "Ring current: ([-+0-9.eE]+) mA"
@@ -73,7 +74,7 @@ def test_scale_makes_the_unit() -> None:
     ],
 )
 def test_what_is_no_number_is_no_reading(text: str, pattern: str) -> None:
-    with pytest.raises(DeviceError, match=r"no number|over range") as caught:
+    with refused(DeviceError) as caught:
         monitor(text, pattern).reading()
     assert caught.value.request == "READ?"
 
@@ -228,7 +229,7 @@ def test_the_current_of_the_moment() -> None:
         assert reading.value == pytest.approx(1e-9 * (reading.time - 99), abs=2.1e-12)
     assert second.time - first.time == pytest.approx(10.02, abs=0.01)
     monitor.close()
-    with pytest.raises(DeviceError, match="it was closed"):
+    with refused(DeviceError):
         monitor.reading()
 
 
@@ -247,7 +248,7 @@ def test_line_ends_and_setup(end: bytes, tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", [b"", b"\xfe\x00\x9c", b"A,+1.0", b"NAN,+1.0,+0.0", b"BUSY"])
 def test_garbage_is_no_reading_and_then_it_goes_on(text: bytes) -> None:
     monitor = over(ElectrometerWire(VirtualClock(), spoilt={0: text}))
-    with pytest.raises(DeviceError, match="have the expected form"):
+    with refused(DeviceError):
         monitor.reading()
     assert monitor.reading().value == 1e-9
 

@@ -19,6 +19,7 @@ from drivers.orca_quest import SENSOR_SHAPE, DcamOptions
 from drivers.testing.camera import CameraBench, CameraConformance
 from tests.drivers.dcam.fake import World
 from tests.drivers.orca_bench import orca_bench, says_what_an_orca_says
+from tests.messages import refused
 
 
 class TestDcamCamera(CameraConformance):
@@ -80,12 +81,12 @@ def test_an_overrun_ring_is_an_error_that_leaves_a_gap_and_a_count(small_ring: D
     """10 frames into 4 slots: 6 are gone and the oldest of the 4 may go at any moment."""
     small_ring.arm(100)
     world.pulses(10)
-    with pytest.raises(DeviceError, match=r"frames 0 to 6"):
+    with refused(DeviceError):
         small_ring.next_frame(1.0)
     assert take(small_ring, 3) == [7, 8, 9]
     assert small_ring.describe()["frames_overwritten"] == 7
     world.pulses(8)
-    with pytest.raises(DeviceError, match=r"frames 10 to 14"):
+    with refused(DeviceError):
         small_ring.next_frame(1.0)
     world.pulses(2)  # another overrun before anything could be taken is no second error: taking must go on
     assert take(small_ring, 3) == [17, 18, 19]
@@ -137,14 +138,14 @@ def test_a_count_of_frames_that_goes_back_is_said_and_not_waited_out(camera: Dca
     world.pulses(3)
     assert take(camera, 3) == [0, 1, 2]
     world.fault("count_back", 2)
-    with pytest.raises(DeviceError, match=r"from 3 to 1.*3 frames"):
+    with refused(DeviceError):
         camera.next_frame(1.0)
 
 
 def test_a_state_that_the_interface_does_not_have_is_an_error_of_the_device(camera: DcamCamera, world: World) -> None:
     camera.arm(1)
     world.fault("odd_status", 9)
-    with pytest.raises(DeviceError, match="status of the camera is 9"):
+    with refused(DeviceError):
         camera.next_frame(1.0)
 
 
@@ -188,7 +189,7 @@ def test_disarm_ends_a_wait_in_another_thread(waiting: Waiting, world: World) ->
     camera, frame = waiting
     aborted = world.calls("dcamwait_abort")
     camera.disarm()
-    with pytest.raises(DeviceRefused, match="not armed"):
+    with refused(DeviceRefused):
         frame.result(timeout=5.0)
     assert world.calls("dcamwait_abort") == aborted + 1
 
@@ -197,7 +198,7 @@ def test_close_waits_for_the_thread_that_is_in_the_library(waiting: Waiting, wor
     camera, frame = waiting
     world.fault("slow_to_wake", 50)  # ms; the fake refuses to close a wait handle that somebody waits with
     camera.close()
-    with pytest.raises(DeviceError, match="is closed"):
+    with refused(DeviceError):
         frame.result(timeout=5.0)
     assert (world.live, world.waiters) == (0, 0)
 
@@ -207,7 +208,7 @@ def test_a_capture_that_ends_by_itself_gives_its_frames_first(camera: DcamCamera
     world.pulses(2)
     world.stop()
     assert take(camera, 2) == [0, 1]
-    with pytest.raises(DeviceError, match=r"READY\)"):
+    with refused(DeviceError):
         camera.next_frame(1.0)
     camera.disarm()  # the library answers "nothing to do", which is no failure
 
@@ -230,7 +231,7 @@ def test_no_memory_for_the_ring_leaves_it_disarmed(camera: DcamCamera, world: Wo
 
 
 def test_an_index_too_high_is_said(world: World) -> None:
-    with pytest.raises(DeviceError, match=r"camera 1."):
+    with refused(DeviceError):
         DcamCamera(world.path, index=1)
     assert world.live == 0
 

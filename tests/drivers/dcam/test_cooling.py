@@ -10,6 +10,7 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.codes import Cooler, Property
 from tests.drivers.dcam.fake import World
+from tests.messages import refused
 
 TARGET = -20.0
 
@@ -68,18 +69,18 @@ def test_a_cooler_s_status_that_is_not_known_is_no_defect(
 def test_a_sensor_that_does_not_get_cold_is_a_timeout(camera: DcamCamera, world: World) -> None:
     play = cool(world, lambda celsius: Cooler.BUSY, rate=0.01)
     began = world.clock.now()
-    with pytest.raises(DeviceTimeout, match=r"after 30 s: -0\.3"):
+    with refused(DeviceTimeout):
         camera.wait_until_cold(30.0, play)
     assert world.clock.now() - began == pytest.approx(30, abs=0.01)
 
 
 def test_a_cooler_that_is_off_is_refused(camera: DcamCamera, world: World) -> None:
     world.override(Property.SENSORCOOLERSTATUS, Cooler.OFF)
-    with pytest.raises(DeviceRefused, match=r"cooler is off \(-20\.0 °C\)\..*the cooler on"):
+    with refused(DeviceRefused):
         camera.wait_until_cold(30.0)
 
 
 def test_a_cooler_in_trouble_is_an_error(camera: DcamCamera, world: World) -> None:
     world.override(Property.SENSORCOOLERSTATUS, Cooler.ERROR2)
-    with pytest.raises(DeviceError, match=r"reports ERROR2 at -20\.0 °C.*and cooling water"):
+    with refused(DeviceError):
         camera.wait_until_cold(30.0)

@@ -16,6 +16,7 @@ from drivers.dcam.camera import DcamCamera
 from drivers.dcam.codes import Error, Property
 from drivers.orca_quest import DcamOptions, GlobalExposure, HotPixelMode, TriggerActive, TriggerMode, TriggerPolarity
 from tests.drivers.dcam.fake import World
+from tests.messages import refused
 
 EXTERNAL = CameraSettings(0.001, TriggerSource.EXTERNAL)
 PULSE_WIDTH = 1e-3
@@ -187,7 +188,7 @@ def test_photon_number_resolving_is_a_readout(world: World) -> None:
         assert camera.timing.min_period == pytest.approx(0.001 + LINES * 172.8e-6)
         described = camera.describe()
         assert (described["readout"], described["conversion_factor"]) == ("photon_number", 1)
-        with pytest.raises(DeviceRefused, match=r"EXPOSURETIME.*0\.0001728 to 1800 s"):
+        with refused(DeviceRefused):
             camera.configure(replace(asked, exposure=100e-6))
         assert camera.configure(EXTERNAL) == EXTERNAL  # and back
 
@@ -200,13 +201,13 @@ def test_repairs_are_refused_where_photons_are_counted(world: World) -> None:
         assert camera.configure(EXTERNAL) == EXTERNAL
 
 
-@pytest.mark.parametrize(("accepted", "refused"), [(0.00100900, False), (0.00101701, False), (0.00101721, True)])
-def test_an_exposure_may_be_rounded_but_not_ignored(world: World, accepted: float, refused: bool) -> None:
+@pytest.mark.parametrize(("accepted", "rejected"), [(0.00100900, False), (0.00101701, False), (0.00101721, True)])
+def test_an_exposure_may_be_rounded_but_not_ignored(world: World, accepted: float, rejected: bool) -> None:
     """By a hundredth and one line time of 7.2 us."""
     with connected(world) as camera:
         world.override(Property.EXPOSURETIME, accepted)
-        if refused:
-            with pytest.raises(DeviceRefused, match=r"EXPOSURETIME = .* instead of 0\.001\..* Expected 0\.001 within"):
+        if rejected:
+            with refused(DeviceRefused):
                 camera.configure(EXTERNAL)
         else:
             assert camera.configure(EXTERNAL).exposure == accepted
@@ -245,14 +246,14 @@ def test_a_library_without_capabilities_of_stamps_is_still_described(world: Worl
 
 def test_what_it_must_have_is_missed_by_name(world: World) -> None:
     world.fault("unsupported", Property.TRIGGERPOLARITY)
-    with pytest.raises(DeviceRefused, match=r"has no TRIGGERPOLARITY\..* Answered 'NOTSUPPORT"):
+    with refused(DeviceRefused):
         world.connect()
     assert world.live == 0
 
 
 def test_a_camera_that_does_not_count_its_frames_is_refused(world: World) -> None:
     world.fault("no_stamps")
-    with pytest.raises(DeviceError, match=r"framestamps 0, 0"):
+    with refused(DeviceError):
         world.connect()
     assert world.live == 0
 

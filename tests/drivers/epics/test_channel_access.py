@@ -17,6 +17,7 @@ from drivers.stages.epics.stage import EpicsSettings, EpicsStage
 from tests.drivers.soft_ioc import PREFIX
 from tests.drivers.stages.epics.test_conformance import USUAL
 from tests.drivers.stages.flat_settings import flat
+from tests.messages import refused
 
 pytest.importorskip("aioca")
 pytest.importorskip("caproto")
@@ -46,11 +47,11 @@ def test_numbers_texts_choices_and_alarms(ioc: ProcessVariable) -> None:
     assert (number.severity, broken.severity) == (0, 3)
     ioc.write("number", -2.25)
     assert ioc.read("number")[0].value == -2.25
-    with pytest.raises(DeviceError, match="INVALID"):
+    with refused(DeviceError):
         PvSource(f"{URL}broken", 10.0).text()
     closed = open_channel(URL, "device", 1.0)
     closed.close()
-    with pytest.raises(DeviceError, match="the connection is closed"):
+    with refused(DeviceError):
         closed.read("number")
 
 
@@ -85,6 +86,6 @@ def test_a_motor_record_moves_until_its_ioc_dies(ioc: ProcessVariable) -> None:
     stage = EpicsStage(url, flat(EpicsSettings, **(USUAL | {"timeout": 2.0})), clock)
     stage.start_move(math.radians(80), math.radians(2))
     ioc.write("number", 666)
-    with pytest.raises(DeviceTimeout, match=r"T:m1\.RBV.*EPICS_CA_ADDR_LIST"):
+    with refused(DeviceTimeout):
         stage.wait(60)
     stage.close()

@@ -13,6 +13,7 @@ from drivers.base.protocols import Shutter
 from drivers.epics.channel import open_channel, url_problem
 from drivers.epics.devices import PvShutter, ShutterPvs
 from tests.drivers.soft_ioc import PREFIX, PvaIoc, TickingClock, Variables, serve_pva
+from tests.messages import refused
 
 pytest.importorskip("p4p")
 URL = f"pva://{PREFIX}"
@@ -78,9 +79,7 @@ def test_a_blade_that_does_not_move_is_an_error(rig: Rig, wanted: bool) -> None:
     if not wanted:
         shutter.open()
     blade.stuck = True
-    with pytest.raises(
-        DeviceTimeout, match=r"did not (open|close) within 4 s.*T:blade is (Open|Closed).*interlock.*check it before"
-    ):
+    with refused(DeviceTimeout):
         (shutter.open if wanted else shutter.close)()
 
 
@@ -89,7 +88,7 @@ def test_a_status_that_nobody_vouches_for_is_not_closed(rig: Rig) -> None:
     blade.severity = 3
     clock.sleep(1)
     for act in (shutter.is_open, shutter.open, shutter.close):
-        with pytest.raises(DeviceError, match=r"INVALID.*near the beam"):
+        with refused(DeviceError):
             act()
 
 
@@ -97,18 +96,18 @@ def test_an_ioc_that_is_gone_is_an_error(rig: Rig) -> None:
     *_, ioc = rig
     ioc.stop()
     short = ShutterPvs(PVS.open_pv, PVS.status_pv, PVS.close_pv, timeout=0.5)
-    with pytest.raises(DeviceTimeout, match=r"no answer within 0.5 s.*EPICS_PVA_ADDR_LIST"):
+    with refused(DeviceTimeout):
         PvShutter(short, TickingClock())
 
 
 @pytest.mark.parametrize("url", ["", "ring", "pva://", "http://ring", "pva://a b"])
 def test_what_is_no_process_variable_is_refused(url: str) -> None:
     assert "expected pva://NAME" in url_problem(url)
-    with pytest.raises(DeviceRefused, match="expected pva://NAME"):
+    with refused(DeviceRefused):
         open_channel(url, "device", 1.0)
 
 
 def test_a_library_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "p4p.client.thread", None)
-    with pytest.raises(DeviceError, match=r'p4p.*cannot be loaded.*pip install "splatline\[epics\]"'):
+    with refused(DeviceError):
         open_channel("pva://ring", "device", 1.0)

@@ -16,6 +16,7 @@ from drivers.serial.line import LineRules, Probe, SerialLine
 from drivers.serial.line_reader import LONGEST_REPLY, Framing
 from simulators.devices.clock import VirtualClock
 from simulators.wires.wire import register
+from tests.messages import refused
 
 NAMES = (f"framing-test-{number}" for number in itertools.count())
 GCS = Framing(command_end=b"\n", line_end=b"\n", continued=" ")
@@ -83,7 +84,7 @@ def test_without_such_a_text_every_line_is_a_reply() -> None:
 
 def test_a_reply_whose_last_line_never_comes_is_a_timeout() -> None:
     line = connect(Script(b"1=2 \n2=3 \n"))
-    with pytest.raises(DeviceTimeout, match="no whole reply"):
+    with refused(DeviceTimeout):
         line.query("A?", r"(?s).*", "lines")
     assert line.query("ID?", "me", "me")[0] == "me"
 
@@ -91,7 +92,7 @@ def test_a_reply_whose_last_line_never_comes_is_a_timeout() -> None:
 def test_a_reply_of_endless_lines_is_given_up() -> None:
     wire = Script(b"123456789 \n" * (LONGEST_REPLY // 5))
     line = connect(wire, timeout=100.0)
-    with pytest.raises(DeviceTimeout, match="no whole reply"):
+    with refused(DeviceTimeout):
         line.query("A?", r"(?s).*", "lines")
     assert wire.clock.now() < 1.0
     assert line.query("ID?", "me", "me")[0] == "me"
@@ -132,7 +133,7 @@ def even(line: str) -> str:
 def test_a_damaged_reply_is_named_and_not_believed_and_the_line_finds_its_step() -> None:
     wire = Script(b"123\n", b"abc\nme\n")
     line = connect(wire, check=even)
-    with pytest.raises(DeviceError, match="3 characters") as error:
+    with refused(DeviceError) as error:
         line.query("A?", r"\d+", "digits")
     assert (error.value.reply, isinstance(error.value, DeviceTimeout)) == ("123", False)
     assert line.query("ID?", "me", "me")[0] == "me"
@@ -142,7 +143,7 @@ def test_a_damaged_reply_is_named_and_not_believed_and_the_line_finds_its_step()
 def test_every_line_of_a_reply_is_checked_and_so_are_notes() -> None:
     for reply in (b"12 \n345\n", b"!no\n12\n"):
         line = connect(Script(reply), unsolicited="!.*", check=even)
-        with pytest.raises(DeviceError, match="damaged"):
+        with refused(DeviceError):
             line.query("A?", r"(?s).*", "anything")
 
 

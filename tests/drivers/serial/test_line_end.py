@@ -22,6 +22,7 @@ from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.serial.line import LineRules, Probe, SerialLine
 from simulators.devices.clock import VirtualClock
 from simulators.wires.wire import Wire, register
+from tests.messages import refused
 from tests.simulators.wires.transports import serve_pty, serve_tcp
 
 NAMES = (f"line-end-test-{number}" for number in itertools.count())
@@ -67,7 +68,7 @@ def test_a_closed_line_says_so_whatever_it_is_asked(serve: Callable[[Wire], Abst
                 lambda: line.send("GO"),
                 lambda: line.send(b"\x18"),
             ):
-                with pytest.raises(DeviceError, match=r"it was closed.*Nothing was sent"):
+                with refused(DeviceError):
                     ask()
 
 
@@ -87,7 +88,7 @@ def test_closing_waits_for_the_request_of_another_thread() -> None:
     closing.join(60.0)
     assert answers == ["1"]
     assert not closing.is_alive()
-    with pytest.raises(DeviceError, match="it was closed"):
+    with refused(DeviceError):
         line.query("N?", "1", "one")
 
 

@@ -15,6 +15,7 @@ from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
 from drivers.testing.stages.bench import LONG, SPEED
 from tests.drivers.stages.rigs import RIGS, RigOf, every_stage
+from tests.messages import refused
 from tests.simulators.wires.transports import serve_pty
 
 needs_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals that pyserial opens")
@@ -105,7 +106,7 @@ def test_limits_in_the_controller_that_leave_no_room_are_respected(maker: str, b
 def test_without_a_reference_it_does_not_move_until_it_has_searched_one(maker: str, unreferenced: Any) -> None:
     rig = RIGS[maker](**unreferenced)
     stage = rig.open()
-    with pytest.raises(DeviceRefused, match=r"reference.*home.*Nothing has moved"):
+    with refused(DeviceRefused):
         stage.start_move(math.radians(10), SPEED)
     stage.start_home()
     assert stage.wait(LONG) == 0.0
@@ -136,7 +137,7 @@ def test_another_makers_controller_is_an_error_in_time_and_turns_nothing(rig_of:
     mine, theirs = rig_of(), RIGS[other]()
     mine.clock, mine.url = theirs.clock, theirs.url
     before = theirs.clock.now()
-    with pytest.raises(DeviceError, match=r"Nothing (has moved|was sent)"):
+    with refused(DeviceError):
         mine.open()
     assert theirs.clock.now() - before < 10.0
     theirs.clock.sleep(60.0)

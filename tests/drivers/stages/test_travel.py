@@ -17,6 +17,7 @@ from drivers.stages.settings import StageFigures
 from drivers.stages.shared import POLL, STOP_MARGIN, longest_stop, until_standing
 from drivers.stages.travel import Travel, least_interval
 from simulators.devices.clock import VirtualClock
+from tests.messages import refused
 
 
 @given(polls=st.integers(-10, 100), part=st.floats(0.01, 0.99), timeout=st.floats(-1, 1))
@@ -74,14 +75,14 @@ def test_the_least_interval_is_the_fewest_units_that_take_the_spacing(
 def test_a_train_at_the_least_interval_is_taken_and_a_closer_one_is_not(unit: int, sign: int) -> None:
     travel = Travel("stage", replace(LIMITS, interval_unit=unit))
     travel.refuse_train(TriggerTrain(5000, sign * 60, 9))
-    with pytest.raises(DeviceRefused, match=r"least 0\.002 s.*max_speed"):
+    with refused(DeviceRefused):
         travel.refuse_train(TriggerTrain(5000, sign * (60 - unit), 9))
     travel.refuse_train(TriggerTrain(5000, sign, 1))
 
 
 def test_an_interval_that_is_no_multiple_of_the_unit_is_refused() -> None:
     Travel("stage", LIMITS).refuse_train(TriggerTrain(5000, 61, 9))
-    with pytest.raises(DeviceRefused, match="multiple of 2 counts") as error:
+    with refused(DeviceRefused) as error:
         Travel("stage", replace(LIMITS, interval_unit=2)).refuse_train(TriggerTrain(5000, 61, 9))
     assert "lower max_speed" not in str(error.value)
 
@@ -91,14 +92,14 @@ def test_an_interval_that_is_no_multiple_of_the_unit_is_refused() -> None:
     [TriggerTrain(0, 100, 0), TriggerTrain(0, 0, 1), TriggerTrain(-1, 100, 3), TriggerTrain(99_801, 100, 3)],
 )
 def test_no_pulse_no_way_between_them_and_a_place_beyond_the_limits_are_refused(train: TriggerTrain) -> None:
-    with pytest.raises(DeviceRefused, match="cannot be emitted"):
+    with refused(DeviceRefused):
         Travel("stage", LIMITS).refuse_train(train)
     Travel("stage", LIMITS).refuse_train(TriggerTrain(99_800, 100, 3))
 
 
 @pytest.mark.parametrize("spacing", [-1e-6, math.nan, math.inf, 1e300])
 def test_a_spacing_that_no_pulses_can_have_is_refused(spacing: float) -> None:
-    with pytest.raises(ValueError, match="apart"):
+    with refused(ValueError):
         StageFigures(counts_per_turn=360_000, max_speed=0.5, acceleration=1.0, low=0.0, high=1.0).limits_with(
             1.0, spacing
         )

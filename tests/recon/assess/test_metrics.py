@@ -25,6 +25,7 @@ from recon.assess.metrics import (
     ssim3d,
     ssim_of_whole_slices,
 )
+from tests.messages import refused
 
 
 def blobs(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float64]:
@@ -193,29 +194,29 @@ def test_the_cuboid_lies_in_the_cylinder(shape: tuple[int, int, int], margin: fl
 
 def test_bad_input_is_refused() -> None:
     ones = np.ones((12, 12, 12))
-    with pytest.raises(ValueError, match=r"\(12, 12, 12\).*\(11, 12, 12\)"):
+    with refused(ValueError):
         psnr(ones, ones[1:])
-    with pytest.raises(ValueError, match="peak must be positive"):
+    with refused(ValueError):
         psnr(-ones, ones)
-    with pytest.raises(ValueError, match="zero everywhere"):
+    with refused(ValueError):
         nrmse(0 * ones, ones)
-    with pytest.raises(ValueError, match="must be positive"):
+    with refused(ValueError):
         ssim3d(ones, ones)
-    with pytest.raises(ValueError, match="row, col"):
+    with refused(ValueError):
         ssim2d(ones, ones)
-    with pytest.raises(ValueError, match="z, y, x"):
+    with refused(ValueError):
         ssim3d(ones[0], ones[0])
-    with pytest.raises(ValueError, match="all voxels have the value 1"):
+    with refused(ValueError):
         kmeans_mask(ones)
-    with pytest.raises(ValueError, match="NaN"):
+    with refused(ValueError):
         kmeans_mask(ones * np.nan)
-    with pytest.raises(ValueError, match="margin"):
+    with refused(ValueError):
         inscribed_cuboid((3, 3, 3), 0.5)
-    with pytest.raises(ValueError, match="0 dense and 1728 empty"):
+    with refused(ValueError):
         snr_cnr(ones, np.zeros(ones.shape, np.int8))
-    with pytest.raises(ValueError, match="NaN"):
+    with refused(ValueError):
         snr_cnr(ones * np.nan, np.eye(12, dtype=np.int8)[None].repeat(12, 0))
-    with pytest.raises(ValueError, match="the mask"):
+    with refused(ValueError):
         snr_cnr(ones, np.zeros((1, 1, 1), np.int8))
 
 

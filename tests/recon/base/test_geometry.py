@@ -13,20 +13,21 @@ from hypothesis import strategies as st
 from recon.base.geometry import Geometry, arrays_of
 from recon.base.ray_width import NO_WIDTH, RayWidth
 from recon.splatting.problem import binned_geometry
+from tests.messages import refused
 from tests.recon.trigonometry import pixel_of
 
 
 def test_a_single_view_is_a_list_of_one_and_none_is_refused() -> None:
     views = Geometry.parallel([0.1, 0.2, 0.3], (2, 2))
     assert views.select(np.array([False, True, False])).angles.tolist() == [0.2]
-    with pytest.raises(ValueError, match="no projections"):
+    with refused(ValueError):
         views.select([])
 
 
 def test_rows_keep_the_columns() -> None:
     cut = Geometry.parallel([0.0], (10, 7), axis_col=2.5).rows(3, 8)
     assert cut.detector_shape == (5, 7) and cut.axis_col == 2.5
-    with pytest.raises(ValueError, match="3:12"):
+    with refused(ValueError):
         Geometry.parallel([0.0], (10, 7)).rows(3, 12)
 
 
@@ -35,7 +36,7 @@ def test_angles_cannot_be_changed_from_outside() -> None:
     geometry = Geometry.parallel(theta, (2, 2))
     theta[0] = 9
     assert geometry.angles[0] == 0
-    with pytest.raises(ValueError, match="read-only"):
+    with refused(ValueError):
         geometry.angles[0] = 1
 
 
@@ -81,7 +82,7 @@ def test_views_keep_their_own_shifts_roll_and_tilt() -> None:
     same = Geometry.parallel([0.1, 0.2], (2, 2), shifts=[[1, 2], [1, 2]], roll=0.3, tilt=0.1).at([0.5, 0.6, 0.7])
     assert same.shifts.tolist() == [[1, 2]] * 3 and same.roll.tolist() == [0.3] * 3 and same.tilt.tolist() == [0.1] * 3
     for bad in ({"shifts": [[0, 1]]}, {"roll": [0.1]}, {"tilt": np.nan}):
-        with pytest.raises(ValueError, match="must be finite"):
+        with refused(ValueError):
             Geometry.parallel([0.1, 0.2], (2, 2), **bad)
 
 

@@ -5,21 +5,21 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pytest
 
 from recon.base.geometry import Geometry
 from recon.voxels.direct import fdk
 from recon.voxels.fbp import fbp
+from tests.messages import refused
 from tests.refused_calls import refused_calls
 
 
 def test_an_axis_is_never_taken_for_a_pitch() -> None:
     """What a user may leave out has a name: a third number was the pitch, and meant as the axis."""
     given: Any = ([0.0], (4, 96), 47.5)
-    with pytest.raises(TypeError, match="positional"):
+    with refused(TypeError):
         Geometry.parallel(*given)
     for cone in ((*given, 50.0, 70.0, 47.5), ([0.0], 96, 0.5, 50.0, 70.0, 47.5)):
-        with pytest.raises(TypeError, match="positional"):
+        with refused(TypeError):
             (Geometry.cone if cone[1] == (4, 96) else Geometry.fan)(*cone)
 
 
@@ -30,9 +30,9 @@ def test_the_axis_is_in_the_middle_unless_told() -> None:
 
 def test_distances_that_float32_does_not_hold_are_refused() -> None:
     """FDK from 1e20 mm gave zeros; the farthest that is taken gives what a parallel beam does."""
-    with pytest.raises(ValueError, match=r"got sod 1e\+20 and sdd 1e\+20. The largest distance is 1e\+09 mm"):
+    with refused(ValueError):
         Geometry.cone([0.0], (4, 4), 1.0, 1e20, 1e20)
-    with pytest.raises(ValueError, match="magnification 1e"):
+    with refused(ValueError):
         Geometry.cone([0.0], (4, 4), 1.0, 1e-9, 1e9)
     angles, sinogram = np.linspace(0, 2 * np.pi, 40, endpoint=False), np.zeros((40, 4, 16), np.float32)
     sinogram[:, :, 5:11] = 1

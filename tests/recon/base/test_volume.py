@@ -22,6 +22,7 @@ from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.projector import Projector
+from tests.messages import refused
 from tests.recon.trigonometry import pixel_of
 from tests.slow_cases import others_slow
 
@@ -188,7 +189,7 @@ def test_a_cone_too_wide_for_a_box_of_its_pixels_is_fitted(turn: np.ndarray) -> 
 
 def test_what_cannot_be_joined_is_told_before_anything_is_placed() -> None:
     views = Geometry.parallel(TURN, (1, 32))
-    with pytest.raises(ValueError, match="joined_pixels=2 is larger than the detector, 1 x 32"):
+    with refused(ValueError):
         reconstruct(np.zeros((48, 1, 32)), views, R2(steps=5, fit=FitSettings(joined_pixels=2)))
 
 
@@ -204,9 +205,9 @@ def test_a_volume_is_saved_with_its_places_and_nothing_is_overwritten(tmp_path: 
     np.testing.assert_array_equal(loaded.volume.data, volume.data)
     assert (loaded.volume.grid, loaded.volume.data.dtype) == (grid, np.float32)
     assert (loaded.method, loaded.settings) == ("r2", {})
-    with pytest.raises(FileExistsError, match="does not overwrite"):
+    with refused(FileExistsError):
         volume.save(tmp_path / "v.npz")
-    with pytest.raises(ValueError, match="beamline export"):
+    with refused(ValueError):
         volume.save(tmp_path / "v.tif")
     assert [path.name for path in tmp_path.iterdir()] == ["v.npz"]
 
@@ -235,7 +236,7 @@ def test_a_grid_takes_any_list_of_whole_numbers() -> None:
 
 
 def test_a_volume_fits_its_grid() -> None:
-    with pytest.raises(ValueError, match="shape"):
+    with refused(ValueError):
         Volume(np.zeros((2, 2, 2), np.float32), Grid((2, 2, 3)))
 
 
@@ -315,5 +316,5 @@ def test_voxels_may_be_longer_along_z() -> None:
     assert grid.spacing == (2.0, 0.5, 0.5)
     np.testing.assert_allclose(grid.coordinates()[0], [-3, -1, 1, 3])
     np.testing.assert_allclose(grid.edges[:, 2], [-4, 4])
-    with pytest.raises(ValueError, match="slice_pitch"):
+    with refused(ValueError):
         Grid((4, 6, 6), 0.5, slice_pitch=0.0)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.features.beam_hardening import Curve, NoCurveError, curve_of_paths, curve_of_spectrum
 from simulators.effects.beam.energies import BeamHardening
+from tests.messages import refused
 from tests.simulators import shots
 
 ENERGIES = st.lists(st.tuples(st.floats(0.1, 1.0), st.floats(10.0, 100.0)), min_size=1, max_size=4)
@@ -52,9 +52,9 @@ def test_weights_follow_the_slope_and_noise_below_zero_the_first_piece() -> None
 def test_what_shows_no_curve_is_refused() -> None:
     rng = np.random.default_rng(2)
     path = rng.uniform(3, 60, 500)
-    with pytest.raises(NoCurveError, match=r"the line integrals"):
+    with refused(NoCurveError):
         curve_of_paths(rng.uniform(0, 2, 500), path, 2.0)
-    with pytest.raises(NoCurveError, match="material: 12"):
+    with refused(NoCurveError):
         curve_of_paths(np.ones(12), np.ones(12), 1.0)
-    with pytest.raises(ValueError, match="ascending"):
+    with refused(ValueError):
         Curve(np.array([0.0, 1.0]), np.array([0.0, 0.0]))

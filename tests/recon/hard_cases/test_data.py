@@ -27,6 +27,7 @@ from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 from recon.voxels.fbp import fbp
+from tests.messages import refused
 from tests.recon.bodies import Bodies
 from tests.recon.helpers import run_steps
 from tests.slow_cases import others_slow
@@ -78,7 +79,7 @@ def a_few(seed: int = 0) -> Gaussians:
 
 def test_projections_of_nothing_are_refused_by_name_and_empty_a_model_that_is_there() -> None:
     nothing = np.zeros((32, *SHAPE), np.float32)
-    with pytest.raises(ValueError, match="no material"):
+    with refused(ValueError):
         reconstruct(nothing, VIEWS, R2(steps=1))
     assert not reconstruct(nothing, VIEWS, "fbp").volume.data.any()
     start = a_few()
@@ -156,7 +157,7 @@ def test_views_with_only_wild_pixels_do_not_cause_filling_in_others(clean: F32) 
 
 def test_one_view_is_refused_by_name_but_no_step_breaks_on_it(clean: F32) -> None:
     one = VIEWS.select([3])
-    with pytest.raises(ValueError, match="determine a volume"):
+    with refused(ValueError):
         reconstruct(clean[3:4], one)
     problem = fit.problem_of(Views(clean[3:4], one), GRID, 0.05, SHORT)
     state = run_steps(fit.init(a_few(), 0), problem, SHORT, 200)

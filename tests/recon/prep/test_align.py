@@ -16,6 +16,7 @@ from recon.prep.align import AxisError, AxisEstimate, axis_from_pair, find_axis
 from recon.prep.axis_wedge import axis_from_sinogram
 from recon.prep.correct import correct
 from recon.prep.references import References
+from tests.messages import refused
 
 COLS = 128
 HALF_TURN = np.arange(180) * np.pi / 180
@@ -198,18 +199,18 @@ def test_order_start_sense_and_place_do_not_matter(
 
 def test_bad_input_is_refused(scan: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
     views, angles = scan
-    with pytest.raises(ValueError, match=r"one angle for each view, got .* \(45,\)"):
+    with refused(ValueError):
         axis_from_sinogram(views, angles[1:])
-    with pytest.raises(ValueError, match="3 projections of 128 columns"):
+    with refused(ValueError):
         find_axis(views[:3], angles[:3])
-    with pytest.raises(ValueError, match="view, row, col"):
+    with refused(ValueError):
         find_axis(views[:, 0], angles)
-    with pytest.raises(ValueError, match=r"\(4, 128\) and \(4, 127\)"):
+    with refused(ValueError):
         axis_from_pair(views[0], views[1, :, 1:])
     broken = views.copy()
     broken[3, 1, 4] = np.nan
     for attempt in (lambda: find_axis(broken, angles), lambda: axis_from_pair(broken[3], broken[4])):
-        with pytest.raises(ValueError, match="NaN or infinite"):
+        with refused(ValueError):
             attempt()
 
 

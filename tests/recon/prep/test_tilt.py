@@ -12,6 +12,7 @@ import pytest
 
 from recon.prep.resample import Resampling
 from recon.prep.tilt import TiltEstimate, find_tilt, roll_of_mean_view
+from tests.messages import refused
 from tests.recon.prep.balls import Balls
 from tests.slow_cases import others_slow
 
@@ -73,15 +74,15 @@ def test_a_wide_field_is_levelled_by_opposite_views() -> None:
 
 def test_what_does_not_show_an_axis_is_refused() -> None:
     sector = Balls(np.radians(np.arange(0, 60, 1.0)))
-    with pytest.raises(ValueError, match="over 180°"):
+    with refused(ValueError):
         _found(sector.views(), sector.angles)
     noise = np.random.default_rng(0).normal(size=(90, 64, 96))
-    with pytest.raises(ValueError, match="not on one line"):
+    with refused(ValueError):
         _found(noise, HALF.angles)
     for cols in (1, 2, 7):
         with pytest.raises(ValueError, match=f"{cols} columns"):
             _found(noise[:, :, :cols], HALF.angles)
-    with pytest.raises(ValueError, match="3 bands of rows are too few to measure the tilt; at least 4"):
+    with refused(ValueError):
         find_tilt(noise[:, :3], np.arange(3.0), HALF.angles)
 
 

@@ -17,6 +17,7 @@ from recon.splatting.checkpoint import arrays_of, state_from
 from recon.splatting.problem import FitProblem
 from recon.splatting.settings import DensityPolicy, FitSettings, growth
 from recon.splatting.splat import project
+from tests.messages import refused
 from tests.recon.conftest import Make
 
 VIEWS = Geometry.parallel(np.linspace(0, np.pi, 7, endpoint=False), (14, 20))
@@ -56,16 +57,16 @@ def test_the_kernel_is_kept(random_gaussians: Make, kernel: Kernel) -> None:
 
 def test_what_is_no_checkpoint_is_refused(random_gaussians: Make) -> None:
     arrays = arrays_of(fit.init(random_gaussians(5), 0))
-    with pytest.raises(ValueError, match=r"first\.means.* missing"):
+    with refused(ValueError):
         state_from({k: v for k, v in arrays.items() if k != "first.means"})
-    with pytest.raises(ValueError, match="shape"):
+    with refused(ValueError):
         state_from({**arrays, "second.raw": arrays["second.raw"][:-1]})
-    with pytest.raises(ValueError, match="kernel_exponent"):
+    with refused(ValueError):
         state_from({**arrays, "kernel_exponent": np.ones(2)})
-    with pytest.raises(ValueError, match="unknown kernel exponent 7"):
+    with refused(ValueError):
         state_from({**arrays, "kernel_exponent": np.array(7.0)})
-    with pytest.raises(ValueError, match="not finite"):
+    with refused(ValueError):
         state_from({**arrays, "parameters.raw": np.full(5, np.nan, np.float32)})
     other = fit.init(random_gaussians(5), np.random.Generator(np.random.MT19937(0)))
-    with pytest.raises(ValueError, match="MT19937"):
+    with refused(ValueError):
         arrays_of(other)

@@ -19,6 +19,7 @@ from recon.splatting.initialise import (
 from recon.splatting.splat import project
 from recon.voxels.field_edges import edges_of
 from recon.voxels.projector import Projector
+from tests.messages import refused
 from tests.recon.conftest import Make
 
 
@@ -99,12 +100,12 @@ def test_the_unit_is_a_density_of_the_sample_however_narrow_the_views(span: floa
 @pytest.mark.parametrize("count", [0, -5])
 def test_no_gaussians_are_refused(count: int, rng: np.random.Generator) -> None:
     views = Geometry.parallel([0.0, 1.0], (4, 6))
-    with pytest.raises(ValueError, match="at least one Gaussian"):
+    with refused(ValueError):
         place(_ball(), Views(np.ones((2, 4, 6), np.float32), views), count, rng)
 
 
 def test_an_empty_volume_is_refused(rng: np.random.Generator) -> None:
-    with pytest.raises(ValueError, match="no material"):
+    with refused(ValueError):
         sample_gaussians(Volume(np.zeros((4, 4, 4), np.float32), Grid((4, 4, 4))), 10, rng, field_radius=5)
 
 
@@ -119,7 +120,7 @@ def test_the_density_scale_is_the_least_squares_factor(random_gaussians: Make, f
 def test_negative_data_are_refused(random_gaussians: Make) -> None:
     g = random_gaussians()
     views = Geometry.parallel([0.0, 1.0], (20, 24), pixel_pitch=0.6)
-    with pytest.raises(ValueError, match="line integrals"):
+    with refused(ValueError):
         scale_to_data(g, -project(g, views).numpy(), views)
 
 

@@ -21,6 +21,7 @@ from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 from tests.clock import SteppedClock
+from tests.messages import refused
 
 SHAPE, PITCH = (24, 36), 0.1
 ANGLES = np.linspace(0, np.pi, 40, endpoint=False)
@@ -97,7 +98,7 @@ def test_pixels_that_measured_nothing_have_no_weight(data: np.ndarray, phantom: 
         model.finish(0.3)
         quality.append(psnr(truth, model.snapshot().data))
     assert quality[0] > quality[1] + 3
-    with pytest.raises(ValueError, match="nothing but NaN"):
+    with refused(ValueError):
         model.add_views(np.full((1, *SHAPE), np.nan, np.float32), ANGLES[:1])
 
 
@@ -163,18 +164,18 @@ def test_views_without_a_sample_at_the_start_are_got_over(data: np.ndarray, phan
 
 def test_bad_views_are_refused_and_leave_the_model_alone(data: np.ndarray) -> None:
     model = StreamingFit(VIEWS, GRID, gaussians=500)
-    with pytest.raises(ValueError, match="shape"):
+    with refused(ValueError):
         model.add_views(data[:2], ANGLES[:3])
     bad = data[:1].copy()
     bad[0, 3, 3] = np.inf
-    with pytest.raises(ValueError, match="were not added"):
+    with refused(ValueError):
         model.add_views(bad, ANGLES[:1])
-    with pytest.raises(ValueError, match="were not added"):
+    with refused(ValueError):
         model.add_views(np.full((1, *SHAPE), 1e300), ANGLES[:1])
     assert model.n_views == 0
-    with pytest.raises(ValueError, match="at least one Gaussian"):
+    with refused(ValueError):
         StreamingFit(VIEWS, GRID, gaussians=0)
-    with pytest.raises(ValueError, match="no projection"):
+    with refused(ValueError):
         model.finish(0.1)
 
 
@@ -188,9 +189,9 @@ def test_the_newest_view_may_be_replaced(data: np.ndarray) -> None:
     assert isinstance(model._stage, Growing) and model.n_views == 22
     np.testing.assert_allclose(model._stage.problem.projections, data[:22], atol=1e-5)
     np.testing.assert_allclose(model._stage.problem.geometry.angles, ANGLES[:22])
-    with pytest.raises(ValueError, match="no projection to replace"):
+    with refused(ValueError):
         StreamingFit(VIEWS, GRID).replace_newest(data[0])
-    with pytest.raises(ValueError, match="were not added"):
+    with refused(ValueError):
         model.replace_newest(np.full(SHAPE, np.nan, np.float32))
 
 
@@ -205,7 +206,7 @@ def test_a_cleared_fit_has_neither_projections_nor_a_model(data: np.ndarray, vie
 
 
 def test_a_setting_that_would_do_nothing_is_refused() -> None:
-    with pytest.raises(ValueError, match="joined_pixels=2"):
+    with refused(ValueError):
         StreamingFit(VIEWS, GRID, settings=FitSettings(joined_pixels=2))
 
 
@@ -242,7 +243,7 @@ def test_a_template_whose_views_differ_is_refused_and_one_shift_is_kept(data: np
 
 
 def test_an_axis_outside_the_detector_is_refused() -> None:
-    with pytest.raises(ValueError, match="axis"):
+    with refused(ValueError):
         StreamingFit(Geometry.parallel([0.0], (8, 64), axis_col=400.0))
 
 

@@ -15,6 +15,7 @@ from recon.splatting.anytime import WHILE_VIEWS_COME
 from recon.splatting.settings import DensityPolicy
 from recon.splatting.stream_placement import Arrivals, StreamPlan
 from recon.splatting.stream_states import Finishing, Growing, Waiting
+from tests.messages import refused
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -93,7 +94,7 @@ class TestWaiting:
 
     def test_the_final_fit_takes_any_number_of_projections_but_needs_material(self) -> None:
         assert _waiting(2).completed(PLAN).views.n == 2
-        with pytest.raises(ValueError, match="material"):
+        with refused(ValueError):
             _waiting(24, np.zeros_like(DATA)).completed(PLAN)
 
 
@@ -110,9 +111,9 @@ class TestGrowing:
 
     def test_a_projection_that_is_not_taken_leaves_it_as_it_was(self) -> None:
         model = _growing(8)
-        with pytest.raises(ValueError, match="no usable value"):
+        with refused(ValueError):
             model.followed_by(np.full((1, *SHAPE), 1e30, np.float32), ANGLES[8:9])
-        with pytest.raises(ValueError, match="no usable value"):
+        with refused(ValueError):
             model.with_images(np.full((4, *SHAPE), np.nan, np.float32), np.arange(4))
         assert model.views.n == model.problem.geometry.n_views == 8
 

@@ -13,6 +13,7 @@ from recon.base.volume import Grid
 from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.fbp import fbp, filter_projections
 from recon.voxels.view_weights import partly_seen
+from tests.messages import refused
 
 
 def disc_views(
@@ -139,13 +140,13 @@ def test_rows_between_the_slices_are_interpolated_and_beyond_the_detector_zero()
 def test_bad_input_is_refused() -> None:
     geometry = Geometry.parallel(half_turn(4), (2, 8))
     good = np.zeros((4, 2, 8), np.float32)
-    with pytest.raises(ValueError, match=r"\(4, 2, 8\)"):
+    with refused(ValueError):
         fbp(good[:3], geometry)
-    with pytest.raises(ValueError, match="ram-lak, shepp-logan, hann"):
+    with refused(ValueError):
         fbp(good, geometry, filter="cosine")  # type: ignore[arg-type]
     bad = good.copy()
     bad[1, 0, 3] = np.nan
-    with pytest.raises(ValueError, match="NaN or infinite"):
+    with refused(ValueError):
         fbp(bad, geometry)
 
 
@@ -182,7 +183,7 @@ def test_direct_methods_refuse_a_climb_that_they_have_no_weights_for(cone: bool)
         else Geometry.parallel(angles, (12, 16), shifts=heights, roll=0.05)
     )
     assert not has_direct_method(geometry)
-    with pytest.raises(ValueError, match=r"an iterative method.*by 10 of 12"):
+    with refused(ValueError):
         direct(np.zeros((90, 12, 16), np.float32), geometry, Grid.matching(geometry))
     assert has_direct_method(replace(geometry, shifts=heights / 4))
 

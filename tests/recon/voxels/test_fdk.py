@@ -12,6 +12,7 @@ from recon.kernels.cpu import joseph
 from recon.voxels import direct as direct_module
 from recon.voxels.direct import fdk
 from recon.voxels.fbp import fbp
+from tests.messages import refused
 from tests.recon.bodies import Bodies
 from tests.slow_cases import others_slow
 
@@ -123,17 +124,17 @@ def test_a_voxel_off_the_detector_gets_nothing() -> None:
 def test_misfits_are_named() -> None:
     views = np.ones((12, 4, 6), np.float32)
     geometry = Geometry.cone(circle(12), (4, 6), 0.1, 10.0, 20.0)
-    with pytest.raises(ValueError, match="use fbp"):
+    with refused(ValueError):
         fdk(views, Geometry.parallel(circle(12), (4, 6)))
-    with pytest.raises(ValueError, match="rolled or tilted"):
+    with refused(ValueError):
         fdk(views, Geometry.cone(circle(12), (4, 6), 0.1, 10.0, 20.0, tilt=0.1))
-    with pytest.raises(ValueError, match="shape"):
+    with refused(ValueError):
         fdk(views[:5], geometry)
-    with pytest.raises(ValueError, match=r"reaches .*at 10"):
+    with refused(ValueError):
         fdk(views, geometry, Grid((2, 9, 9), 2.0))
-    with pytest.raises(ValueError, match=r"filter .* is unknown"):
+    with refused(ValueError):
         fdk(views, geometry, filter="box")  # type: ignore[arg-type]
     for value in (np.nan, np.inf, np.finfo(np.float32).max):  # the last one is finite before the filter
         views[3, 1, 2] = value
-        with pytest.raises(ValueError, match="NaN"), np.errstate(over="ignore", invalid="ignore"):
+        with refused(ValueError), np.errstate(over="ignore", invalid="ignore"):
             fdk(views, geometry)

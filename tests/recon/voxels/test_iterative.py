@@ -24,6 +24,7 @@ from recon.voxels.iterative import solve, watched
 from recon.voxels.methods import FistaTv, OsSirtTv
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import density_unit, largest_eigenvalue
+from tests.messages import refused
 from tests.recon.kernels.voxels_reference import system_matrix
 from tests.recon.voxels.tv_reference import differences, total_variation, transposed_differences
 from tests.slow_cases import others_slow
@@ -313,18 +314,18 @@ def test_asd_pocs_takes_a_short_scan_of_a_cone() -> None:
 
 def test_misuse_is_named() -> None:
     projector, truth, views = parallel_case()
-    with pytest.raises(ValueError, match=r"projections .* \(7, 6, 20\).* \(7, 6, 19\)"):
+    with refused(ValueError):
         solve(Sirt(), projector, views[..., 1:])
-    with pytest.raises(ValueError, match="iterations must be"):
+    with refused(ValueError):
         solve(Sirt(0), projector, views)
-    with pytest.raises(ValueError, match="all projections are zero"):
+    with refused(ValueError):
         solve(Sirt(), projector, np.zeros_like(views))
-    with pytest.raises(ValueError, match="not all zero"):
+    with refused(ValueError):
         solve(Sirt(), projector, views, weight=np.zeros_like(views))
-    with pytest.raises(ValueError, match="first volume"):
+    with refused(ValueError):
         solve(Sirt(), projector, views, start=Volume(truth[:3].copy(), Grid((3, 18, 17), 0.5)))
     views[0, 0, :2] = np.nan, np.inf
-    with pytest.raises(ValueError, match=r"weight 0: 2 of 840 .*not finite"):
+    with refused(ValueError):
         solve(Sirt(), projector, views)
 
 

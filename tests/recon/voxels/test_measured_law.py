@@ -20,6 +20,7 @@ from recon.voxels.voxel_problem import VoxelProblem
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
+from tests.messages import refused
 from tests.slow_cases import others_slow
 
 F32 = NDArray[np.float32]
@@ -160,12 +161,12 @@ def test_what_cannot_be_measured_is_refused() -> None:
     views, geometry, open_beam, _ = scan(96, 300)
     rng = np.random.default_rng(0)
     few = np.arange(39)
-    with pytest.raises(ValueError, match="needs 40 projections and 3 frames of the open beam; got 39 and 8"):
+    with refused(ValueError):
         measured_law(views[few], geometry.select(few), [39], rng, open_beam)
-    with pytest.raises(ValueError, match="needs 40 projections and 3 frames of the open beam; got 96 and 2"):
+    with refused(ValueError):
         measured_law(views, geometry, [96], rng, open_beam[:2])
     cone = Geometry.cone(geometry.angles, (ROWS, SIDE), pixel_pitch=PITCH, sod=5.0, sdd=7.0)
-    with pytest.raises(ValueError, match="cone"):
+    with refused(ValueError):
         measured_law(views, cone, [96], rng, open_beam)
-    with pytest.raises(ValueError, match="nothing to reconstruct"):
+    with refused(ValueError):
         measured_law(np.zeros_like(views), geometry, [96], rng, open_beam)

@@ -18,6 +18,7 @@ from recon.base.geometry import Geometry
 from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector, measured_share, project
+from tests.messages import refused
 from tests.recon.helpers import assert_transpose
 from tests.recon.kernels.voxels_reference import system_matrix
 
@@ -258,14 +259,14 @@ def test_parallel_projections_agree_with_astra(rng: np.random.Generator) -> None
 
 def test_misfits_are_named() -> None:
     volume, geometry, _ = _gaussian_case([0.1], 23.5, 1.0, (2.0, 1.0), 3.0)
-    with pytest.raises(ValueError, match="almost a right angle"):  # a half cone of 50 degrees, tilted by 44
+    with refused(ValueError):  # a half cone of 50 degrees, tilted by 44
         project(volume, Geometry.cone([0.1], (145, 48), 1.0, 60.0, 60.0, tilt=np.deg2rad(44)))
-    with pytest.raises(ValueError, match=r"reaches .* mm .* source is .*20"):
+    with refused(ValueError):
         project(volume, Geometry.cone([0.1], (3, 48), 1.0, 20.0, 40.0))
     near = Geometry.cone([0.1, np.pi / 4], (3, 48), 1.0, 1.02 * 4 * np.sqrt(2), 40.0)
-    with pytest.raises(ValueError, match="half a voxel beyond"):  # which has weight in rays, behind the source
+    with refused(ValueError):  # which has weight in rays, behind the source
         Projector(near, Grid((1, 8, 8)))
-    with pytest.raises(ValueError, match=r"volume must have the shape .* got \(3, 2, 2\)"):
+    with refused(ValueError):
         Projector(geometry, volume.grid).forward(np.zeros((3, 2, 2), np.float32))
 
 

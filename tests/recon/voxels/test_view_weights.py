@@ -24,6 +24,7 @@ from recon.voxels.view_weights import (
     ray_weights,
     unseen_wedges,
 )
+from tests.messages import refused
 from tests.recon.voxels.test_fbp import disc_views, half_turn
 
 
@@ -171,7 +172,7 @@ def test_two_missing_sectors_are_missed_however_wide() -> None:
 
 @pytest.mark.parametrize("angles", [[], [0.0, np.nan]])
 def test_weights_of_no_angle_are_refused(angles: list[float]) -> None:
-    with pytest.raises(ValueError, match="at least one angle"):
+    with refused(ValueError):
         angular_weights(angles)
 
 
@@ -190,7 +191,7 @@ def test_uneven_steps_of_a_circle_weigh_by_their_cells_and_sum_to_a_turn(rng: np
 
 @pytest.mark.parametrize(("span", "n"), [(180, 90), (200, 25), (270, 100), (300, 40)])
 def test_weights_of_the_circle_are_not_those_of_a_short_scan(span: float, n: int) -> None:
-    with pytest.raises(ValueError, match=r"gap of .* degrees.*full circle"):
+    with refused(ValueError):
         circle_weights(np.deg2rad(np.linspace(0, span, n)))
 
 
@@ -222,11 +223,11 @@ def test_what_a_short_scan_lacks_is_said_in_degrees(arc: float, lacking: float) 
     geometry = Geometry.fan(np.deg2rad(np.linspace(0, arc, 400, endpoint=False)), 41, 1.0, 150.0, 300.0)
     assert np.rad2deg(missing_arc(geometry)) == pytest.approx(lacking, abs=0.05)
     if lacking:
-        with pytest.raises(ValueError, match=r"some rays through the field of view are in no projection"):
+        with refused(ValueError):
             cone_weights(geometry)
     gaps = Geometry.fan([0, 0.1, 0.2, 0.3, 0.4, 2.0, 2.1, 2.2, 2.3, 4.0], 41, 1.0, 150.0, 300.0)
     assert missing_arc(gaps) == np.inf
-    with pytest.raises(ValueError, match=r"angles without several gaps"):
+    with refused(ValueError):
         cone_weights(gaps)
 
 

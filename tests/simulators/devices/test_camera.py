@@ -21,6 +21,7 @@ from simulators.devices.trigger_line import Pulse, TriggerLine
 from simulators.frame.sensor import CONVERSION
 from simulators.scenes.scene import load_scene
 from tests.drivers.orca_bench import SETTINGS, orca_bench, says_what_an_orca_says
+from tests.messages import refused
 from tests.simulators import chance
 
 FLUX = 4e5
@@ -254,14 +255,14 @@ def test_an_unplugged_camera_is_gone_but_disarms() -> None:
     bench.clock.sleep(1.0)
     assert [frame.framestamp for frame in bench.take(3)] == [0, 1, 2]
     for call in (lambda: bench.camera.next_frame(1.0), lambda: bench.camera.configure(SETTINGS)):
-        with pytest.raises(DeviceError, match="unplugged at frame 3"):
+        with refused(DeviceError):
             call()
     bench.camera.disarm()
-    with pytest.raises(DeviceError, match="unplugged"):
+    with refused(DeviceError):
         bench.camera.arm(1)
     bench.camera.close()
     free = _Bench(unplug_at=0)
-    with pytest.raises(DeviceError, match="unplugged at frame 0"):
+    with refused(DeviceError):
         free.one()
 
 
@@ -270,7 +271,7 @@ def test_a_ring_that_is_overrun_names_the_lost_frames_and_goes_on() -> None:
     bench.camera.arm(10)
     bench.fire(7)
     bench.clock.sleep(1.0)  # a reader that looked away
-    with pytest.raises(DeviceError, match=r"3 frames are lost: framestamps \[0, 1, 2\]"):
+    with refused(DeviceError):
         bench.camera.next_frame(1.0)
     assert [frame.framestamp for frame in bench.take(4)] == [3, 4, 5, 6]
     bench.fire(1)
@@ -283,7 +284,7 @@ def test_cancelled_pulses_expose_nothing() -> None:
     times = bench.fire(5)
     bench.take(2)
     bench.line.cancel_after(times[1] + 0.001)
-    with pytest.raises(DeviceTimeout, match="armed for 5 and exposed 2"):
+    with refused(DeviceTimeout):
         bench.camera.next_frame(1.0)
 
 
@@ -292,7 +293,7 @@ def test_software_triggers_faster_than_the_camera_are_refused() -> None:
     bench.camera.configure(replace(SETTINGS, trigger=TriggerSource.SOFTWARE))
     bench.camera.arm(2)
     bench.camera.software_trigger()
-    with pytest.raises(DeviceRefused, match=r"in 10\.2 ms"):
+    with refused(DeviceRefused):
         bench.camera.software_trigger()
     assert bench.camera.next_frame(1.0).framestamp == 0
 

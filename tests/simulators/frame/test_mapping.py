@@ -11,6 +11,7 @@ from typing import Any, Literal
 import pytest
 
 from simulators.frame.mapping import SceneError, build, choose, located, named
+from tests.messages import refused
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def test_values_take_the_declared_types(mapping: dict[str, Any], expected: Outer
 
 @pytest.mark.parametrize("value", [None, "many", "", "nan", math.nan, math.inf, "-inf", [1], {"a": 1}, 10**400])
 def test_a_number_is_finite(value: Any) -> None:
-    with pytest.raises(SceneError, match=r"^outer\.real is .+; expected a number$"):
+    with refused(SceneError):
         build(Outer, "outer", {"real": value})
 
 
@@ -106,7 +107,7 @@ def test_an_entry_names_its_kind_alone_or_with_its_keys() -> None:
     assert choose("x", choices, {"kind": "inner", "kv": 1}) == Inner(1.0)
     assert named("x", ["inner"], {"kind": "inner", "kv": 1}) == ("inner", {"kv": 1})
     for entry in ("teapot", {"kind": "teapot"}, {}, 3, None):
-        with pytest.raises(SceneError, match=r"^x: kind .* is unknown; legal: inner, outer$"):
+        with refused(SceneError):
             choose("x", choices, entry)
 
 

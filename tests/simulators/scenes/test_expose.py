@@ -23,6 +23,7 @@ from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 from simulators.samples.sample import Sample
 from simulators.scenes.expose import Scan, expose
 from simulators.scenes.scene import Scene, load_scene
+from tests.messages import refused
 from tests.simulators import shots
 from tests.simulators.bodies import SOLIDS
 from tests.simulators.shots import PHANTOM
@@ -155,9 +156,9 @@ def test_a_converter_of_ones_own_has_its_electrons_a_count() -> None:
 
 
 def test_what_cannot_be_is_refused() -> None:
-    with pytest.raises(IndexError, match=r"which has 0 \.\.\. 10"):
+    with refused(IndexError):
         _scan().frame(11)
-    with pytest.raises(ValueError, match="got 0"):
+    with refused(ValueError):
         _scan(views=0)
     for changes, words in (
         ({"detector": {"shape": [2400, 100]}}, "do not fit on the sensor of 2304 x 4096"),

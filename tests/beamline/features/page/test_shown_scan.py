@@ -20,6 +20,7 @@ from beamline.storage.readers.open import open_scan
 from recon.base.volume import Grid
 from recon.prep.resample import Resampling
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, frames_of, write_exchange, write_flagged
+from tests.messages import refused
 
 SCAN = TwoCylinders()
 ALL = TileRegion(0, 9999, 0, 9999)
@@ -126,10 +127,10 @@ def test_a_slice_with_a_tilt_is_that_of_views_turned_by_it(tmp_path: Path) -> No
 
 
 def test_what_cannot_be_shown_is_a_sentence(shown: ShownScan, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="Row 4 is outside the detector, which has 4 rows"):
+    with refused(DataError):
         shown.fbp(4, 20.0, 0.0, ALL, fast=True)
-    with pytest.raises(DataError, match="no lights to average"):
+    with refused(DataError):
         shown.mean("lights")
     tifffile.imwrite(tmp_path / "scan.tif", SCAN.counts(), photometric="minisblack")
-    with closing(ShownScan(open_scan(tmp_path / "scan.tif"))) as scan, pytest.raises(DataError, match="--angles FILE"):
+    with closing(ShownScan(open_scan(tmp_path / "scan.tif"))) as scan, refused(DataError):
         scan.axis(0)

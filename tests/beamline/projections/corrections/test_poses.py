@@ -24,6 +24,7 @@ from recon.voxels.direct import direct
 from recon.voxels.projector import seen_rays
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import DARK, frames_through, write_flagged
+from tests.messages import refused
 from tests.recon.voxels.test_projector import ellipsoid_shadow, smooth_ball
 from tests.slow_cases import others_slow
 
@@ -128,23 +129,23 @@ def test_vectors_state_all_of_the_geometry(tmp_path: Path, cone: bool, selected:
 def test_vectors_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path) -> None:
     columns, cone = f"view,{VECTOR_COLUMNS.format('src')}", vectors_of(free(cone=True))
     file = table(tmp_path, columns, np.arange(N), *cone.T)
-    with pytest.raises(ConfigError, match=r"of a cone, but .* give --cone 10(\.\d+)?:15\."):
+    with refused(ConfigError):
         prepared(path, file, axis_col=None)
-    with pytest.raises(ConfigError, match=r"pixels of 60 um, .*of 40 um.*--pixel-size-um"):
+    with refused(ConfigError):
         prepared(path, file, axis_col=None, cone=(10.0, 15.0))
-    with pytest.raises(ConfigError, match=r"--axis: the vectors"):
+    with refused(ConfigError):
         prepared(path, file, cone=(10.0, 15.0))
     cone[5, 6:9] *= 1.1
     file = table(tmp_path, columns, np.arange(N), *cone.T)
-    with pytest.raises(DataError, match=r"projection 5: the detector pixels .* Nothing was read"):
+    with refused(DataError):
         prepared(path, file, axis_col=None, cone=(10.0, 15.0))
-    with pytest.raises(ValueError, match=r"expected a header .*src_x, src_y"):
+    with refused(ValueError):
         read_poses(str(table(tmp_path, columns.replace(",u_z", ""), np.arange(N), *np.delete(cone, 8, axis=1).T)))
     np.savez(tmp_path / "others.npz", vectors=cone)
-    with pytest.raises(ValueError, match=r"parallel3d_vec and cone_vec"):
+    with refused(ValueError):
         read_poses(str(tmp_path / "others.npz"))
     np.savez(tmp_path / "complex.npz", parallel3d_vec=cone * 1j)
-    with pytest.raises(ValueError, match=r"complex\.npz: parallel3d_vec is complex128.*; expected numbers"):
+    with refused(ValueError):
         read_poses(str(tmp_path / "complex.npz"))
     np.savez(tmp_path / "damaged.npz", cone_vec=cone)
     damaged = bytearray((tmp_path / "damaged.npz").read_bytes())
@@ -206,7 +207,7 @@ def test_the_axis_is_found_with_the_shifts(tmp_path: Path) -> None:
 
 def test_poses_of_all_views_are_not_needed_where_some_are_chosen(path: Path, tmp_path: Path) -> None:
     head, columns = f"view,{COLUMNS}", (np.arange(N), *SHIFTS.T, *TURNS.T)
-    with pytest.raises(DataError, match=r"for 20 of.*frame 5, at 31.5 degrees.*--views"):
+    with refused(DataError):
         prepared(path, table(tmp_path, head, *(column[::2] for column in columns)))
     found = prepared(path, table(tmp_path, head, *(column[:30] for column in columns)), views="first:20")
     assert found.geometry.n_views == 20 and found.lines.unseen is not None and found.lines.unseen.geometry.n_views <= 10
@@ -235,7 +236,7 @@ def test_a_file_that_is_no_table_of_poses_is_refused(tmp_path: Path, text: str, 
     (tmp_path / "poses.csv").write_text(text)
     with pytest.raises(ValueError, match=match):
         read_poses(str(tmp_path / "poses.csv"))
-    with pytest.raises(ValueError, match=r"none\.csv"):
+    with refused(ValueError):
         read_poses(str(tmp_path / "none.csv"))
 
 
@@ -251,7 +252,7 @@ def test_poses_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path) 
         with pytest.raises(DataError, match=match):
             prepared(path, table(tmp_path, head, *columns))
     turned = (PosesOfFile(read_poses(str(every(tmp_path)))), TiltAndLens(1.0))
-    with pytest.raises(ConfigError, match="--tilt and --poses both"):
+    with refused(ConfigError):
         prepared(path, every(tmp_path), steps=turned)
 
 

@@ -21,6 +21,7 @@ from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.storage.conftest import EPOCH, INFO
 from tests.clock import SteppedClock
+from tests.messages import refused
 
 Write = Callable[[list[Frame]], Path]
 
@@ -151,7 +152,7 @@ def test_several_entries_need_a_default(tmp_path: Path) -> None:
     with h5py.File(path, "r+") as file:
         file.copy("entry0000", "entry0001")
         file["entry0001/sample/rotation_angle"][...] = 7
-    with pytest.raises(DataError, match="several detectors with frames"):
+    with refused(DataError):
         open_scan(path)
     with h5py.File(path, "r+") as file:
         file.attrs["default"] = "entry0001"
@@ -169,7 +170,7 @@ def test_frames_in_a_linked_file_that_is_gone(tmp_path: Path) -> None:
     with open_scan(path) as source:
         assert source.read([5])[0, -1, -1] == 119
     (tmp_path / "pixels.h5").unlink()
-    with pytest.raises(DataError, match=r"pixels\.h5::data"):
+    with refused(DataError):
         open_scan(path)
 
 
@@ -212,7 +213,7 @@ def test_virtual_frames_that_cannot_be_read_are_no_zeros(tmp_path: Path, lose: C
     with open_scan(path) as source:
         assert source.read([5])[0, -1, -1] == 119
     lose(tmp_path / "pixels.h5")
-    with pytest.raises(DataError, match=r"refers to frames in.*pixels\.h5"):
+    with refused(DataError):
         open_scan(path)
 
 
@@ -244,15 +245,15 @@ def test_virtual_frames_join_the_tiles_of_a_detector(tmp_path: Path, tiles: list
         shorter = part["data"][:-1]
         del part["data"]
         part["data"] = shorter
-    with pytest.raises(DataError, match=r"refers to frames in.*tile1\.h5"):
+    with refused(DataError):
         open_scan(path)
 
 
 def test_a_file_that_is_not_there_yet_can_be_waited_for(tmp_path: Path) -> None:
-    with pytest.raises(NotReadyError, match="does not exist"):
+    with refused(NotReadyError):
         open_scan(tmp_path / "soon.h5", follow=True)
     (tmp_path / "soon.h5").write_bytes(b"")
-    with pytest.raises(NotReadyError, match="cannot be followed yet"):
+    with refused(NotReadyError):
         open_scan(tmp_path / "soon.h5", follow=True)
 
 

@@ -20,6 +20,7 @@ from beamline.projections.selection import Selection
 from beamline.projections.views import checked_views, select
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.stored_order import SINOGRAM
+from tests.messages import refused
 
 VIEWS = np.arange(5 * 3 * 4, dtype=np.float32).reshape(5, 3, 4)
 NAMES = ("view", "row", "col")
@@ -106,10 +107,10 @@ def test_an_npz_is_read_by_its_names(tmp_path: Path, packed: Callable[..., None]
             assert source.table.kinds.tolist() == [2, 1, 1, 0, 0, 0, 0, 0]
             np.testing.assert_array_equal(source.read(slice(1, None)), np.concatenate([VIEWS[:2] + 1, VIEWS]))
             np.testing.assert_allclose(source.table.angles[3:], ANGLES)
-    with pytest.raises(DataError, match=r"no dataset b.* It has /projections \(5 x 3 x 4\), /angles \(5\)"):
+    with refused(DataError):
         open_scan(SourceOptions(tmp_path / "s.npz", data_path="b"))
     (tmp_path / "cut.npz").write_bytes((tmp_path / "s.npz").read_bytes()[:300])
-    with pytest.raises(DataError, match=r"cut.npz is damaged.*BadZipFile"):
+    with refused(DataError):
         open_scan(SourceOptions(tmp_path / "cut.npz", angles=ANGLES))
 
 
@@ -122,9 +123,7 @@ def test_objects_of_python_are_refused_as_pickles(tmp_path: Path, name: str) -> 
 
 def test_what_is_no_sinogram_of_so_many_angles_is_said(tmp_path: Path) -> None:
     np.save(tmp_path / "s.npy", VIEWS[:, 1])
-    with pytest.raises(
-        DataError, match=r"has 9 angles, but .* is one image of 5 x 4 pixels. If the image is a sinogram"
-    ):
+    with refused(DataError):
         open_scan(SourceOptions(tmp_path / "s.npy", angles=np.arange(9.0)))
 
 
@@ -216,5 +215,5 @@ def test_a_damaged_chunk_of_a_zarr_is_named(tmp_path: Path) -> None:
     (tmp_path / "s.zarr" / "c" / "2" / "0" / "0").write_bytes(b"no chunk")
     with open_scan(tmp_path / "s.zarr") as source:
         np.testing.assert_array_equal(source.read([1, 3]), VIEWS[[1, 3]])
-        with pytest.raises(DataError, match=r"Frame 2 of / in .* cannot be read"):
+        with refused(DataError):
             source.read([2])

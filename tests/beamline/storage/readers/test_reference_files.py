@@ -14,6 +14,7 @@ from beamline.core.errors import DataError
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.reference_files import load_images
 from drivers.base.frame import FrameKind
+from tests.messages import refused
 
 SHAPE = (6, 8)
 IMAGES = np.random.default_rng(3).integers(0, 60000, (4, *SHAPE)).astype(np.uint16)
@@ -79,11 +80,11 @@ def test_one_of_several_is_named_and_a_single_image_is_one_frame(tmp_path: Path)
         file["a/dark"], file["a/flat"] = IMAGES, OTHERS[0]
     np.testing.assert_array_equal(load_images(f"{path}::/a/dark", FrameKind.DARK), IMAGES)
     np.testing.assert_array_equal(load_images(f"{path}::a/flat", FrameKind.FLAT), OTHERS[:1])
-    with pytest.raises(DataError, match=r"several datasets.*/a/dark \(4 x 6 x 8\).*--darks FILE::DATASET"):
+    with refused(DataError):
         load_images(path, FrameKind.DARK, SHAPE)
-    with pytest.raises(DataError, match=r"no dataset /b\. It has"):
+    with refused(DataError):
         load_images(f"{path}::/b", FrameKind.DARK)
-    with pytest.raises(DataError, match=r"of 9 x 9"):
+    with refused(DataError):
         load_images(path, FrameKind.FLAT, (9, 9))
 
 
@@ -98,7 +99,7 @@ def test_what_is_no_images_is_refused(tmp_path: Path) -> None:
         drawn = h5py.VirtualLayout(IMAGES.shape, np.uint16)
         drawn[:] = h5py.VirtualSource("gone.h5", "data", IMAGES.shape)
         file.create_virtual_dataset("data", drawn)
-    with pytest.raises(DataError, match=r"gone\.h5"):
+    with refused(DataError):
         load_images(tmp_path / "v.h5", FrameKind.DARK)
 
 
@@ -108,7 +109,7 @@ def test_a_number_stands_for_darks_of_every_pixel(tmp_path: Path, monkeypatch: p
     assert (darks.tolist(), darks.dtype) == ([[[300] * 3] * 2], np.uint16)
     tifffile.imwrite("300", np.full((2, 3), 7, np.uint16))
     assert load_images("300", FrameKind.DARK, (2, 3)).max() == 7
-    with pytest.raises(DataError, match="cannot be read"):
+    with refused(DataError):
         load_images("301.5", FrameKind.DARK, (2, 3))
 
 

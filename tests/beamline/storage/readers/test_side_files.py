@@ -12,6 +12,7 @@ from beamline.core.errors import DataError
 from beamline.features.files.validate import validate
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.side_files import read_side_file
+from tests.messages import refused
 
 N, SHAPE = 6, (4, 8)
 NIKON = f"""[XTekCT]
@@ -145,7 +146,7 @@ def test_commas_that_may_be_of_thousands_are_refused(images: Path, old: str, new
     with pytest.raises(DataError, match=why):
         read_side_file(images / "s.log")
     (images / "s.log").write_text(SKYSCAN.replace(".000", ",000").replace("40.00", "40"))
-    with pytest.raises(DataError, match="60,000 has a comma, and it is not clear whether this is a decimal comma"):
+    with refused(DataError):
         read_side_file(images / "s.log")
 
 

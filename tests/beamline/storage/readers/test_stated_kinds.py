@@ -14,6 +14,7 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from drivers.base.frame import FrameKind
 from tests.beamline.scans import write_nxtomo
 from tests.beamline.storage.readers.foreign_scans import FRAMES, nxtomo
+from tests.messages import refused
 
 DARK, FLAT, VIEW, NONE = FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION, FrameKind.INVALID
 SHAPE = (4, 6)
@@ -85,7 +86,7 @@ def test_angles_are_those_of_all_views_or_of_the_selected_ones(series: Path) -> 
             views = source.table.kinds == VIEW
             assert source.read(np.flatnonzero(views))[:, 0, 0].tolist() == [3, 5, 7, 9]
             np.testing.assert_allclose(source.table.angles[views], [1, 3, 5, 7])
-    with pytest.raises(DataError, match=r"selects no projection: .* has 8"):
+    with refused(DataError):
         open_scan(SourceOptions(series, frames="darks=0:1,flats=1:2,8:", angles=np.arange(8.0)))
 
 
@@ -102,9 +103,9 @@ def test_a_scan_in_several_files_is_read_as_one(tmp_path: Path) -> None:
         assert source.read(slice(None))[:, 1, 1].tolist() == list(range(10))
         np.testing.assert_allclose(np.degrees(source.table.angles[5:]), 10.0 * np.arange(5, 10))
         assert source.table.part_starts.tolist() == [0]  # no file is a part that should have flats of its own
-    with pytest.raises(DataError, match=r"gone\.nxs does not exist"):
+    with refused(DataError):
         open_scan(SourceOptions(paths[0], then=(tmp_path / "gone.nxs",)))
-    with pytest.raises(DataError, match="cannot be followed with --append"):
+    with refused(DataError):
         open_scan(SourceOptions(paths[0], then=(paths[1],)), follow=True)
 
 
@@ -117,9 +118,9 @@ def test_views_of_two_energies_are_refused_and_one_can_be_chosen(tmp_path: Path)
         assert source.energy_kev == 20
         assert source.table.kinds.tolist() == [2, 2, 3, 1, 0, 3, 0, 3, 0]
     assert not [hit for hit in validate(SourceOptions(path, frames="energy=20")) if hit.rule == "energies"]
-    with pytest.raises(DataError, match=r"no frame of .* has this energy; 4 at 20 keV, 2 at 30 keV"):
+    with refused(DataError):
         open_scan(SourceOptions(path, frames="energy=25"))
-    with pytest.raises(DataError, match="does not state the energy of each frame"):
+    with refused(DataError):
         open_scan(SourceOptions(nxtomo(tmp_path / "t.nx"), frames="energy=25"))
 
 

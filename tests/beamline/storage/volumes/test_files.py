@@ -21,6 +21,7 @@ from beamline.storage.volumes.base import Pixels, Slices, facts_of, record_of
 from beamline.storage.volumes.files import format_of, opened_volume, volume_format, write_volume
 from beamline.storage.volumes.images import tiff
 from recon.base.volume import Grid, Volume
+from tests.messages import refused
 
 SHAPE = 3, 4, 5
 VALUES = ((np.arange(60.0).reshape(SHAPE) - 7) / 8).astype(np.float32)
@@ -160,7 +161,7 @@ def test_a_failure_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize("name", NAMES)
 def test_nothing_is_overwritten(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("precious")
-    with pytest.raises(DataError, match="never overwritten"):
+    with refused(DataError):
         write_volume(tmp_path / name, RECORD)
     assert (tmp_path / name).read_text() == "precious"
     assert list(tmp_path.iterdir()) == [tmp_path / name]
@@ -187,7 +188,7 @@ def test_large_volumes_are_a_bigtiff_of_ome(tmp_path: Path, monkeypatch: pytest.
     with opened_volume(tmp_path / "v.tif") as read:
         np.testing.assert_array_equal(read.volume.data[:], VALUES)
         assert (read.volume.grid, read.title) == (RECORD.volume.grid, RECORD.title)
-    with pytest.raises(DataError, match="this program wrote"):
+    with refused(DataError):
         open_scan(tmp_path / "v.tif")
 
 

@@ -16,6 +16,7 @@ from beamline.page.volume import ScaledSlices, slices_of
 from beamline.storage.foreign_zarr import ZarrScale, open_zarr
 from beamline.storage.volume_file import read_volume
 from beamline.storage.volumes.files import opened_volume
+from tests.messages import refused
 
 SHAPE = 21, 130, 151
 VALUES = np.random.default_rng(4).integers(0, 900, SHAPE, dtype=np.uint16)
@@ -110,14 +111,14 @@ def test_what_is_no_volume_is_refused(tmp_path: Path, monkeypatch: pytest.Monkey
     for name, said in (("bare", "Name one of its arrays"), ("channels", "one time and one channel")):
         with pytest.raises(DataError, match=said), opened_volume(tmp_path / f"{name}.zarr"):
             pass
-    with pytest.raises(DataError, match="as a Zarr"), opened_volume(tmp_path / "bare.zarr", "nothing"):
+    with refused(DataError), opened_volume(tmp_path / "bare.zarr", "nothing"):
         pass
     chunk = next(path for path in (tmp_path / "cut.zarr/s0/c").rglob("*") if path.is_file())
     chunk.write_bytes(chunk.read_bytes()[:20])
-    with opened_volume(tmp_path / "cut.zarr") as record, pytest.raises(DataError, match="cannot be read"):
+    with opened_volume(tmp_path / "cut.zarr") as record, refused(DataError):
         _ = record.volume.data[:]
     monkeypatch.setitem(sys.modules, "zarr", None)
-    with pytest.raises(DataError, match=r"pip install splatline\[zarr\]"), opened_volume(tmp_path / "bare.zarr"):
+    with refused(DataError), opened_volume(tmp_path / "bare.zarr"):
         pass
 
 
@@ -146,5 +147,5 @@ def test_a_voxel_without_a_size_is_refused(tmp_path: Path, scale: float) -> None
     said = group.attrs["multiscales"]
     said[0]["datasets"][0]["coordinateTransformations"] = [{"type": "scale", "scale": [1.0, 1.0, scale]}]
     group.attrs["multiscales"] = said
-    with pytest.raises(DataError, match=r"expected (lengths above 0|3 numbers)"):
+    with refused(DataError):
         open_zarr(tmp_path / "v.zarr")

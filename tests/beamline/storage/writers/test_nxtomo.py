@@ -22,6 +22,7 @@ from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.storage.conftest import INFO, SHAPE, append
 from tests.clock import SteppedClock
+from tests.messages import refused
 
 Write = Callable[[list[Frame]], Path]
 
@@ -225,7 +226,7 @@ def test_an_exception_inside_leaves_a_failed_but_readable_file(
     tmp_path: Path, clock: SteppedClock, frames: list[Frame]
 ) -> None:
     with (
-        pytest.raises(RuntimeError, match="camera"),
+        refused(RuntimeError),
         NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock) as writer,
     ):
         append(writer, frames[0])
@@ -238,10 +239,10 @@ def test_an_exception_inside_leaves_a_failed_but_readable_file(
 def test_never_overwrites(tmp_path: Path, clock: SteppedClock) -> None:
     path = tmp_path / "s.h5"
     path.write_bytes(b"precious")
-    with pytest.raises(DataError, match="never overwrites"):
+    with refused(DataError):
         NXtomoWriter(path, INFO, SHAPE, clock=clock)
     assert path.read_bytes() == b"precious"
-    with pytest.raises(DataError, match="cannot be created"):
+    with refused(DataError):
         NXtomoWriter(tmp_path / "no" / "folder.h5", INFO, SHAPE, clock=clock)
 
 
@@ -259,13 +260,13 @@ def test_wrong_frames_are_refused_and_nothing_is_written(
     ):
         with pytest.raises(DataError, match=said):
             writer.append(bad, digest(good.counts))
-    with pytest.raises(DataError, match="preview"):
+    with refused(DataError):
         writer.append(good, digest(good.counts, preview_bin=2))
-    with pytest.raises(ValueError, match="Status"):
+    with refused(ValueError):
         writer.close("splendid")
     assert (writer.rows, writer.committed) == (1, 1)
     writer.close()
-    with pytest.raises(DataError, match="closed"):
+    with refused(DataError):
         writer.append(good, digest(good.counts))
     with h5py.File(tmp_path / "s.h5") as file:
         assert {file[path].shape[0] for path in layout.COLUMNS} == {1}

@@ -27,6 +27,7 @@ from beamline.storage.writers.rows import Rows, put_exchange_view
 from drivers.base.frame import Frame
 from tests.beamline.storage.conftest import INFO, SHAPE, append
 from tests.clock import SteppedClock
+from tests.messages import refused
 
 
 def test_a_full_disk_is_named_and_earlier_rows_stay(
@@ -38,7 +39,7 @@ def test_a_full_disk_is_named_and_earlier_rows_stay(
         patch.setattr(Rows, "write", full)
         with pytest.raises(DataError, match=r"store the frame in .*s\.h5.*No space left.*are free.*first 1 frames"):
             append(writer, frames[1])
-    with pytest.raises(DataError, match="earlier write failed"):
+    with refused(DataError):
         append(writer, frames[1])
     writer.close()
     assert not writer.remarks
@@ -152,7 +153,7 @@ def test_a_file_that_the_disk_has_no_room_for_is_not_left_half_made(
     full = Mock(side_effect=no_room())
 
     monkeypatch.setattr(layout, "create", full)
-    with pytest.raises(DataError, match=r"s\.h5 cannot be created \(No space left on device\)"):
+    with refused(DataError):
         NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     assert list(tmp_path.iterdir()) == []
 

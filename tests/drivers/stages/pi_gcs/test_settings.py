@@ -10,6 +10,7 @@ from drivers.base.errors import DeviceRefused
 from drivers.base.protocols import TriggerTrain
 from drivers.stages.pi_gcs.settings import PiFirstPulse
 from tests.drivers.stages.pi_gcs_rig import Rig
+from tests.messages import refused
 
 
 @pytest.fixture
@@ -42,7 +43,7 @@ def test_the_wrong_rule_shows_in_the_number_of_pulses(rule: str, says: str, expe
 
 def test_a_train_off_the_grid_is_refused_where_the_firmware_has_one() -> None:
     stage = Rig(first_pulse=PiFirstPulse.GRID).open(first_pulse="grid")
-    with pytest.raises(DeviceRefused, match="100 counts"):
+    with refused(DeviceRefused):
         stage.arm(TriggerTrain(250, 100, 3))
 
 
@@ -50,9 +51,9 @@ def test_arming_too_near_before_the_first_pulse_is_refused_where_a_step_goes_bef
     rig = Rig(first_pulse=PiFirstPulse.STEP_AFTER)
     bench = rig.bench(first_pulse="step_after")
     bench.go(3.0)
-    with pytest.raises(DeviceRefused, match=r"2\.5000 deg.*1\.0000 deg"):
+    with refused(DeviceRefused):
         bench.stage.arm(bench.train(3.5, 1.0, 3))
-    with pytest.raises(DeviceRefused, match="the first pulse"):
+    with refused(DeviceRefused):
         bench.stage.arm(bench.train(3.0, 1.0, 3))
     bench.go(2.0)
     bench.stage.arm(bench.train(3.5, 1.0, 3))
@@ -65,5 +66,5 @@ def test_pulses_that_would_merge_are_refused() -> None:
     stage = Rig().open(firmware_pulse=60e-6)
     stage.arm(TriggerTrain(100, 1, 3))
     stage.close()
-    with pytest.raises(DeviceRefused, match="cannot be emitted"):
+    with refused(DeviceRefused):
         Rig().open(firmware_pulse=70e-6).arm(TriggerTrain(100, 1, 3))

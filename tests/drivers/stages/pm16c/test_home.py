@@ -11,6 +11,7 @@ from drivers.base.errors import DeviceError
 from drivers.base.protocols import TriggerTrain
 from drivers.testing.stages.bench import LONG, SPEED
 from tests.drivers.pm16c_rig import Rig
+from tests.messages import refused
 
 SWITCH = 2500
 """Pulses since power-on: 10 degrees of the sample's true angle."""
@@ -84,7 +85,7 @@ def test_the_speed_of_a_search_is_the_configured_one_or_a_tenth_of_the_fastest(r
     "settings", [{"home_speed": 100.0}, {"home_speed": 0.0}, {"home": math.nan}, {"home": -math.inf}]
 )
 def test_settings_of_a_search_that_cannot_be_are_refused(rig: Rig, settings: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"search for home|home switch|home(_speed)? is (0.0|nan|-inf)"):
+    with refused(ValueError):
         rig.open(**settings)
     rig.open().close()
 
@@ -98,13 +99,13 @@ def test_a_stage_whose_switch_is_not_found_says_so() -> None:
     stage = rig.open()
     stage.start_home()
     for _ in range(2):
-        with pytest.raises(DeviceError, match=r"short \(emergency stop\).*is at 1000 counts"):
+        with refused(DeviceError):
             stage.wait(LONG)
 
 
 def test_a_switch_that_is_not_plugged_in_is_named_at_once() -> None:
     stage = Rig(home_at=None).open()
-    with pytest.raises(DeviceError, match=r"did not start.*COMMAND ERROR"):
+    with refused(DeviceError):
         stage.start_home()
     assert not stage.moving()
 
@@ -116,7 +117,7 @@ def test_a_stop_button_after_the_switch_was_found_is_no_less_a_stop(rig: Rig) ->
     while rig.say("SHP?B") == "NO H.P":
         rig.clock.sleep(0.01)
     rig.say("ASSTP")
-    with pytest.raises(DeviceError, match="stop command"):
+    with refused(DeviceError):
         stage.wait(LONG)
     where = stage.to_counts(stage.position())
     rig.clock.sleep(10.0)
@@ -137,7 +138,7 @@ def test_a_stop_that_crosses_the_way_back_to_the_switch_stops_it(rig: Rig) -> No
         listen(data)
 
     rig.controller.receive = stop_before_going_home
-    with pytest.raises(DeviceError, match="stopped short"):
+    with refused(DeviceError):
         stage.wait(LONG)
     assert not stage.moving()
     assert stage.to_counts(stage.position()) > SWITCH

@@ -8,6 +8,7 @@ from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
 from drivers.stages.pm16c.settings import Pm16cFirstPulse
 from tests.drivers.pm16c_rig import Rig
+from tests.messages import refused
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -31,19 +32,19 @@ def test_a_train_is_right_whether_the_start_point_fires_or_not_as_long_as_that_i
 def test_the_room_before_the_first_pulse_is_in_the_limits_and_asked_for() -> None:
     bench = Rig(fires_at_start=False).bench(first_pulse="interval_after")
     assert bench.stage.limits.run_up == 1
-    with pytest.raises(DeviceRefused, match="the pulse output opens"):
+    with refused(DeviceRefused):
         bench.stage.arm(bench.train(1.0, 1.0, 5))
     bench.stage.close()
     bench = Rig().bench()
     assert bench.stage.limits.run_up == 0
     bench.stage.close()
-    with pytest.raises(ValueError, match="sometimes"):
+    with refused(ValueError):
         Rig().open(first_pulse="sometimes")
 
 
 def test_firmware_without_the_status_of_one_channel_is_refused_in_words() -> None:
     rig = Rig(version="1.46 06-10-14 PM16C-04X")
-    with pytest.raises(DeviceRefused, match=r"firmware 1\.46.*Expected 1\.47 or later.*Nothing has moved"):
+    with refused(DeviceRefused):
         rig.open()
     Rig(version="1.47 12-10-14 PM16C-04XD").open().close()
 
@@ -53,7 +54,7 @@ def test_the_status_of_another_channel_is_not_believed() -> None:
     stage = rig.open()
     transmit = rig.transmit
     rig.transmit = lambda: transmit().replace(b"RBS", b"RAS")  # type: ignore[method-assign]
-    with pytest.raises(DeviceError, match="form"):
+    with refused(DeviceError):
         stage.moving()
     rig.transmit = transmit  # type: ignore[method-assign]
     stage.close()

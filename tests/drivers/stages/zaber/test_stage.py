@@ -16,6 +16,7 @@ from drivers.testing.stages.bench import LONG, SPEED
 from simulators.wires.wire import register
 from tests.drivers.stages.rig import NAMES
 from tests.drivers.zaber_rig import REPLIES_TO_OPEN, Rig
+from tests.messages import refused
 from tests.simulators.wires.zaber.wire import Fault
 
 
@@ -57,7 +58,7 @@ def test_every_packet_has_a_checksum_and_an_id_of_its_own(rig: Rig) -> None:
 
 def test_a_real_stages_turn_is_checked() -> None:
     rig = Rig(counts_per_turn=384_000)
-    with pytest.raises(DeviceRefused, match="a turn has 384000 microsteps"):
+    with refused(DeviceRefused):
         rig.open()
     stage = rig.open(counts_per_turn=384_000)
     assert stage.limits.counts_per_turn == 384_000
@@ -85,7 +86,7 @@ def test_settings_that_it_cannot_have_are_refused_before_anything_is_sent(
 def test_another_device_in_the_chain_and_an_axis_that_is_not_there(rig: Rig) -> None:
     with pytest.raises(DeviceTimeout):
         rig.open(device=2)
-    with pytest.raises(DeviceRefused, match=r"no such axis \(BADAXIS\)"):
+    with refused(DeviceRefused):
         rig.open(axis=2)
     Rig(address=37).open(device=37).close()
 
@@ -106,14 +107,14 @@ def test_native_units_are_speed_times_a_factor_and_acceleration_ten_thousand_tim
 def test_a_driver_that_somebody_disabled_is_named(rig: Rig) -> None:
     stage = rig.open()
     rig.say("/1 1 driver disable")
-    with pytest.raises(DeviceRefused, match=r"\(DRIVERDISABLED\).*Nothing has moved"):
+    with refused(DeviceRefused):
         stage.start_move(0.1, SPEED)
 
 
 def test_a_move_of_somebody_else_is_waited_for_or_named(rig: Rig) -> None:
     stage = rig.open()
     rig.say("/1 1 move abs 20000")
-    with pytest.raises(DeviceRefused, match="moves"):
+    with refused(DeviceRefused):
         stage.start_move(0.1, SPEED)
     assert math.degrees(stage.wait(LONG)) == pytest.approx(20.0)
 
@@ -196,7 +197,7 @@ class _Bus:
 def test_two_devices_with_one_address_are_refused_before_anything_moves(delay: bool) -> None:
     one, other = Rig(), Rig()
     one.url = register(next(NAMES), _Bus(one, other, delay))
-    with pytest.raises(DeviceError, match=r"two devices answered one request.*same address"):
+    with refused(DeviceError):
         one.open()
     assert one.controller.device.axis.position(one.clock.now()) == 0
 
@@ -207,7 +208,7 @@ def test_other_outputs_can_be_switched_and_that_of_the_pulses_cannot(rig: Rig) -
     output.set(True)
     assert output.get()
     assert rig.say("/1 0 io get do") == "0 1 0 0"
-    with pytest.raises(DeviceRefused, match="trigger pulses"):
+    with refused(DeviceRefused):
         stage.digital_output(1)
 
 
@@ -216,7 +217,7 @@ def test_other_outputs_can_be_switched_and_that_of_the_pulses_cannot(rig: Rig) -
 
 def test_the_reply_to_another_message_is_named_and_the_next_request_is_in_step_again() -> None:
     stage = Rig(faults={REPLIES_TO_OPEN: Fault.OTHER_ID}).open()
-    with pytest.raises(DeviceError, match=r"does not have the expected form.*reply to message"):
+    with refused(DeviceError):
         stage.position()
     assert stage.position() == 0.0
 
@@ -232,7 +233,7 @@ def test_an_alert_is_passed_over_and_a_request_to_repeat_is_followed(fault: Faul
 
 def test_a_device_that_asks_to_repeat_for_ever_is_named() -> None:
     stage = Rig(faults=dict.fromkeys(range(REPLIES_TO_OPEN, 1000), Fault.AGAIN)).open()
-    with pytest.raises(DeviceRefused, match="repeatedly asks"):
+    with refused(DeviceRefused):
         stage.position()
 
 
@@ -240,5 +241,5 @@ def test_a_stop_that_got_lost_is_noticed(rig: Rig) -> None:
     stage = rig.open()
     stage.start_move(math.radians(100), math.radians(1))
     rig.lose("stop")
-    with pytest.raises(DeviceTimeout, match=r"still moving .*the stop command"):
+    with refused(DeviceTimeout):
         stage.stop()

@@ -15,6 +15,7 @@ from drivers.base.protocols import TriggerTrain
 from drivers.stages.zaber.settings import ZaberSettings, set_up
 from drivers.testing.stages.bench import LONG, SPEED, StageBench
 from tests.drivers.zaber_rig import Rig
+from tests.messages import refused
 
 
 def counts_of(bench: StageBench) -> list[int]:
@@ -152,7 +153,7 @@ def test_a_toggled_output_rests_after_a_train_and_after_disarming_in_the_middle(
 def test_firmware_without_schedule_says_so_and_is_served_by_toggling() -> None:
     rig = Rig(can_schedule=False)
     bench = rig.bench()
-    with pytest.raises(DeviceRefused, match=r"be set up.*schedule.*toggle.*no trigger pulses"):
+    with refused(DeviceRefused):
         bench.stage.arm(bench.train(1.0, 1.0, 3))
     bench.go(10.0)
     assert bench.pulses() == []
@@ -164,7 +165,7 @@ def test_firmware_whose_actions_enable_no_triggers_says_so_and_is_served_unchain
     rig = Rig(can_chain=False)
     bench = rig.bench()
     train = bench.train(10.0, 1.0, 5)
-    with pytest.raises(DeviceRefused, match="chained"):
+    with refused(DeviceRefused):
         bench.stage.arm(train)
     bench.stage.close()
     bench = rig.bench(chained=False)
@@ -186,14 +187,14 @@ def test_an_unchained_train_ends_when_it_is_turned_away_from(back: float, pulses
 def test_an_unchained_train_without_room_before_it_is_refused() -> None:
     bench = Rig(can_chain=False).bench(chained=False)
     bench.go(-5.0)
-    with pytest.raises(DeviceRefused, match="room for one step"):
+    with refused(DeviceRefused):
         bench.stage.arm(bench.train(-4.5, 1.0, 5))
 
 
 def test_firmware_without_triggers_turns_but_does_not_arm() -> None:
     bench = Rig(firmware="7.05").bench()
     assert not bench.stage.limits.trigger_output
-    with pytest.raises(DeviceRefused, match=r"7\.05 has no triggers.*7\.06"):
+    with refused(DeviceRefused):
         bench.stage.arm(bench.train(1.0, 1.0, 3))
     assert bench.go(3.0) == pytest.approx(3.0)
 

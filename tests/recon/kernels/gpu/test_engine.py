@@ -18,6 +18,7 @@ from recon.splatting.backend import Backend, Cpu, backend_for
 from recon.splatting.checkpoint import arrays_of, state_from
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import NAMES, DensityPolicy, FitSettings
+from tests.messages import refused
 from tests.recon.conftest import Make
 from tests.recon.helpers import run_steps
 from tests.recon.kernels.gpu.on_gpu import UNIT, cone, parallel
@@ -77,7 +78,7 @@ def test_a_fit_is_the_same_on_both_backends(
 
 def test_errors_say_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gpu, "interpreted", lambda: False)
-    with pytest.raises(ValueError, match="devices, got cpu"):
+    with refused(ValueError):
         gpu.require("cpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(RuntimeError, match="finds no CUDA device"):
@@ -85,7 +86,7 @@ def test_errors_say_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    with pytest.raises(ValueError, match=r"cuda:1.*current device, cuda:0.*CUDA_VISIBLE_DEVICES=1"):
+    with refused(ValueError):
         gpu.require("cuda:1")
     for absent in ("cuda:2", "cuda:200"):  # torch takes the latter for a device of negative number
         with pytest.raises(ValueError, match=r"finds 2 CUDA.*Use cuda"):

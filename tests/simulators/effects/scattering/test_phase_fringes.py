@@ -14,6 +14,7 @@ from scipy.ndimage import gaussian_filter
 
 from simulators.effects.scattering.phase_fringes import HC, PhaseFringes
 from simulators.frame.shot import Detector, Shot
+from tests.messages import refused
 from tests.simulators import shots
 
 Reals = NDArray[np.float64]
@@ -136,7 +137,7 @@ def test_oversampling_alone_averages_over_a_pixel() -> None:
 
 
 def test_transport_far_from_the_sample_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"is 0.5, but.* at most 16.1 mm"):
+    with refused(ValueError):
         PhaseFringes(40.0, _distance(0.5), 20.0, method="transport").apply(np.zeros((8, 8)), _shot((8, 8)))
 
 
@@ -145,10 +146,7 @@ def test_a_wave_that_would_alias_is_refused_and_the_depth_left() -> None:
     depth[:, 32:] = 1.0
     effect = PhaseFringes(20.0, 1.0, 20.0)
     kept = depth.copy()
-    with pytest.raises(
-        ValueError,
-        match=r"by 10 rad.*allows 1.57.* or method transport",
-    ):
+    with refused(ValueError):
         effect.apply(depth, _shot((64, 64)))
     np.testing.assert_array_equal(depth, kept)
     replace(effect, oversampling=7).apply(depth, _shot((64, 64)))
@@ -158,7 +156,7 @@ def test_a_propagator_that_would_alias_is_refused() -> None:
     """wavelength z = N p² is the last that is taken."""
     far, shot = _distance(1 / 64), _shot((64, 80))
     PhaseFringes(1.0, far * 0.999, 20.0).apply(np.zeros((64, 80)), shot)
-    with pytest.raises(ValueError, match=r"alias over.*0.01[56], and 64.* need 0.016 or more"):
+    with refused(ValueError):
         PhaseFringes(1.0, far * 1.001, 20.0).apply(np.zeros((64, 80)), shot)
-    with pytest.raises(ValueError, match="propagator would alias"):
+    with refused(ValueError):
         PhaseFringes(1.0, far * 0.6, 20.0, oversampling=2).apply(np.zeros((64, 80)), shot)

@@ -26,6 +26,7 @@ from simulators.samples.bodies.solids import (
     plate,
     truncated_octahedron,
 )
+from tests.messages import refused
 from tests.refused_calls import refused_calls
 from tests.simulators import bodies
 from tests.simulators.bodies import SOLIDS, inside
@@ -121,10 +122,10 @@ def test_solids_may_share_a_name() -> None:
 
 def test_names_that_do_not_fit_are_refused() -> None:
     ball = Ellipsoid((0.1, 0.1, 0.1), 1.0)
-    with pytest.raises(ValueError, match="3 solids"):
+    with refused(ValueError):
         Phantom.of([ball] * 3, names=["a", "b"])
     Phantom.of([ball] * 255, names=[f"grain {i}" for i in range(255)])
-    with pytest.raises(ValueError, match="255 names"):
+    with refused(ValueError):
         Phantom.of([ball] * 256, names=[f"grain {i}" for i in range(256)])
 
 
@@ -144,7 +145,7 @@ def test_a_scene_can_give_a_polyhedron_by_its_corners_alone() -> None:
     corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
     solid = choose("here", KINDS, {"kind": "polyhedron", "attenuation": 2, "vertices": corners})
     assert bodies.volume(solid) == pytest.approx(1 / 6)
-    with pytest.raises(SceneError, match="faces is not a known key"):
+    with refused(SceneError):
         choose("here", KINDS, {"kind": "polyhedron", "attenuation": 2, "faces": []})
 
 

