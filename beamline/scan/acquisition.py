@@ -14,12 +14,13 @@ from beamline.core.text import spans
 from beamline.plan.passes import Choice, Passes, passes_at_start, triggers_to_take
 from beamline.plan.plan import Block, Timeline, middle_of_exposure, retake_block
 from beamline.scan.control import State
-from beamline.scan.exposures import SLICE, Exposures
+from beamline.scan.exposures import Exposures
 from beamline.scan.ledger import LedgerError
 from beamline.scan.moves import in_words, make_safe, remembered_places, require_in_place, set_shutter_and_sample
 from beamline.scan.references import REFERENCES, copied
 from beamline.scan.supervision import Supervision
 from beamline.scan.tally import BlockTally, astray_views, discrepancies, first_taken, missing_views, recover
+from beamline.scan.waits import SLICE
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError
 from drivers.base.frame import Frame, FrameKind

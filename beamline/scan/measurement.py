@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,10 +18,9 @@ from beamline.core.files import RECON_LOG, SCAN
 from beamline.core.process import ChildProcess
 from beamline.core.run_result import RunResult
 from beamline.core.stop import PauseRequest, StopRequest
-from beamline.core.text import count
 from beamline.instrument.connect import ConnectedDevices, enter_pressed
 from beamline.plan.choose import ScanTarget
-from beamline.plan.plan import Block, Retake, spread_retakes
+from beamline.plan.plan import Block
 from beamline.plan.timeline import block_seconds
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.backlog import prepare_memory
@@ -35,6 +34,7 @@ from beamline.scan.preflight import ReadyScan
 from beamline.scan.recorder import Recorder
 from beamline.scan.references import REFERENCES, ReferenceReport, recorded_in
 from beamline.scan.resume import ResumableRun
+from beamline.scan.retakes import Retakes
 from beamline.scan.supervision import PAUSE_POLL, BeamLog, Supervision, beam_log
 from beamline.simulate import LabelLog, labels_path, write_labels
 from beamline.storage.writers.nxtomo import NXtomoWriter
@@ -106,30 +106,7 @@ class Measurement:
 
     @cached_property
     def decider(self) -> Decider:
-        scan, timeline, devices = self.config.scan, self.ready.timeline, self.instrument.devices
-
-        def seconds_of(block: Block) -> float:
-            return block_seconds(
-                block, devices.stage.limits, self.ready.timing, self.ready.plan.settle, devices.stage.position()
-            )
-
-        after = timeline.blocks[timeline.blocks.index(timeline.views) :]
-        return Decider(
-            asks=scan.decide == "ask",
-            target=ScanTarget(**dict(scan.target)),
-            wait=scan.wait_s,
-            timeline=timeline,
-            seconds_of=seconds_of,
-            now=self.instrument.clock.now,
-            states=self.states,
-            stop=self.stop,
-            sink=self.sink,
-            added_seconds=sum(seconds_of(block) for block in after if block.kind in REFERENCES and scan.decide != "off")
-            + (self.series.seconds if self.series else 0.0),
-            retaken=self.series.retaken if self.series else 0,
-            number=len(timeline.plan.choices),
-            close_shutter=lambda: None if devices.shutter.by_hand else devices.shutter.close(),
-        )
+        return _decider_of(self)
 
     def take(self, command: Sequence[str] | None, release: Callable[[], None], *, draws: bool = False) -> RunResult:
         """Take the scan, and close its file.
@@ -177,8 +154,7 @@ class Measurement:
             recorder.finish()
         faults = self.references.faults(recorder.references)
         missing, closed = acquisition.missing, False
-        early = "stopped" if isinstance(ended.error, ScanStopped) else "failed"
-        status, reason = ("complete", "") if ended.error is None else (early, user_message(ended.error))
+        status, reason = ended.how
         with ended.kept():
             if not recorder.hangs:  # a write that does not return holds the lock of HDF5, and closing would wait for it
                 writer.close(status, missing, beam.readings, reason)
@@ -225,7 +201,7 @@ class Measurement:
         self, acquisition: FrameSource, recorder: Recorder, labels: LabelLog, follower: LiveReconstruction | None
     ) -> None:
         if self.config.simulation is None and self.source_of is None:
-            self._wait_for(follower)
+            _wait_for(follower, self.stop, self.states)
         # If the recorder fails, closing the iterator makes the instrument safe.
         with closing(acquisition.frames()) as frames:
             for frame in frames:
@@ -233,13 +209,6 @@ class Measurement:
                 if self.instrument.simulated is not None:
                     labels.add(frame.index, self.instrument.simulated.labels(frame.time))
                 recorder.put(frame)
-
-    def _wait_for(self, follower: LiveReconstruction | None) -> None:
-        """Wait until the live reconstruction is ready for projections."""
-        if follower is not None:
-            follower.wait_ready(
-                READY_WITHIN, lambda: self.stop.stopping, lambda text: self.states.enter(self.states.state, text)
-            )
 
     def _recorder(self, writer: NXtomoWriter) -> Recorder:
         monitor = self.config.monitor
@@ -260,16 +229,17 @@ class Measurement:
 
     def _acquisition(self, recorder: Recorder, beam: BeamLog, follower: LiveReconstruction | None) -> Acquisition:
         ready, instrument, decider = self.ready, self.instrument, self.decider
+        retakes = Retakes(ready.timeline, recorder, decider, self.states, self.stop, self.sink)
         acquisition = Acquisition(
             instrument.devices, ready.timeline, ready.settings, ready.plan.settle, instrument.clock, self.stop,
             self.sink,
             Supervision(
                 lambda: self._refusal(recorder, follower), self.pause, lambda: wait_in_pause(recorder), self.states,
-                lambda missing: self._retakes(recorder, missing),
+                retakes.begin,
                 lambda: beam.wait_for_reading(lambda: self.stop.stopping),
                 next_pass=None if self.config.scan.decide == "off" else decider,
                 pass_ended=recorder.end_pass,
-                n_retakable=lambda missing: len(self._to_retake(recorder, missing)[0]),
+                n_retakable=retakes.n_possible,
                 turn=lambda: self.turn(self, lambda: wait_in_pause(recorder)),
                 recorded=lambda block: () if self.first_state is None else recorded_in(self.first_state, block),
             ),
@@ -290,51 +260,58 @@ class Measurement:
         are only logged."""
         recorder.wait()
         if self.config.simulation is not None:
-            self._wait_for(follower)
+            _wait_for(follower, self.stop, self.states)
         if self.stop.stopping:
             return None
         blocks = self.ready.timeline.blocks
         faults = self.references.faults(recorder.references, blocks[: blocks.index(self.ready.timeline.views)])
         if not faults or self.config.references.on_fault == "log":
             return None
-        return (
-            "Stopped before the first projection, because the darks or flats cannot be used. "
-            f"{' '.join(faults.values())} The shutter was told to close; the {recorder.n_frames} darks and flats "
-            "are in the file. Fix the fault, check a few frames and the exposure with `beamline tune`, and "
-            "start the scan again. To scan anyway, set references.on_fault: log."
+        return _stopped_sentence(faults.values(), recorder.n_frames)
+
+
+def _decider_of(run: Measurement) -> Decider:
+    """The decider of a scan, before its first frame."""
+    scan, timeline, devices = run.config.scan, run.ready.timeline, run.instrument.devices
+
+    def seconds_of(block: Block) -> float:
+        return block_seconds(
+            block, devices.stage.limits, run.ready.timing, run.ready.plan.settle, devices.stage.position()
         )
 
-    def _retakes(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:
-        """Projections that are taken again because they were flagged or gave no frame. Their number is announced to the
-        recorder."""
-        chosen, n_bad = self._to_retake(recorder, missing)
-        if not chosen:
-            return ()
-        if len(chosen) < n_bad:
-            self.sink(
-                Warned(
-                    f"{n_bad} projections were flagged or gave no frame, but only {len(chosen)} may be "
-                    f"taken again (monitor.retake_share). The other {n_bad - len(chosen)} remain as they "
-                    "are."
-                )
-            )
-        recorder.expect_more(len(chosen), self.ready.timeline.retake_seconds * len(chosen) / self.ready.plan.retakes)
-        self.states.enter(State.ACQUIRING, f"Taking {count(len(chosen), 'projection')} again")
-        return chosen
+    after = timeline.blocks[timeline.blocks.index(timeline.views) :]
+    return Decider(
+        asks=scan.decide == "ask",
+        target=ScanTarget(**dict(scan.target)),
+        wait=scan.wait_s,
+        timeline=timeline,
+        seconds_of=seconds_of,
+        now=run.instrument.clock.now,
+        states=run.states,
+        stop=run.stop,
+        sink=run.sink,
+        added_seconds=sum(seconds_of(block) for block in after if block.kind in REFERENCES and scan.decide != "off")
+        + (run.series.seconds if run.series else 0.0),
+        retaken=run.series.retaken if run.series else 0,
+        number=len(timeline.plan.choices),
+        close_shutter=lambda: None if devices.shutter.by_hand else devices.shutter.close(),
+    )
 
-    def _to_retake(self, recorder: Recorder, missing: Sequence[int]) -> tuple[Sequence[Retake], int]:
-        """Projections that may be taken again now, and the number of those that were flagged or gave no frame. If there
-        are more than the plan allows, an evenly spread part of them.
-        """
-        allowed = self.ready.plan.retakes - recorder.announced - self.decider.retaken
-        if allowed <= 0:
-            return (), 0
-        recorder.wait()
-        flagged = recorder.flagged.views_to_retake
-        # the others were already taken again
-        once = [view for view in flagged if view.trigger < self.ready.plan.angles.size]
-        bad = sorted([*once, *(Retake(-1, trigger) for trigger in missing)], key=lambda view: view.trigger)
-        return ((), 0) if self.stop.stopping else (spread_retakes(bad, allowed), len(bad))
+
+def _wait_for(follower: LiveReconstruction | None, stop: StopRequest, states: StateMachine) -> None:
+    """Wait until the live reconstruction is ready for projections."""
+    if follower is not None:
+        follower.wait_ready(READY_WITHIN, lambda: stop.stopping, lambda text: states.enter(states.state, text))
+
+
+def _stopped_sentence(faults: Iterable[str], n_frames: int) -> str:
+    """Why no projection was taken, and what to do."""
+    return (
+        "Stopped before the first projection, because the darks or flats cannot be used. "
+        f"{' '.join(faults)} The shutter was told to close; the {n_frames} darks and flats "
+        "are in the file. Fix the fault, check a few frames and the exposure with `beamline tune`, and "
+        "start the scan again. To scan anyway, set references.on_fault: log."
+    )
 
 
 def wait_in_pause(recorder: Recorder) -> bool:
@@ -352,6 +329,13 @@ class _Ending:
     def __init__(self, sink: Sink) -> None:
         self._sink = sink
         self.error: BaseException | None = None
+
+    @property
+    def how(self) -> tuple[str, str]:
+        """The status of the file, and the reason for it."""
+        if self.error is None:
+            return "complete", ""
+        return "stopped" if isinstance(self.error, ScanStopped) else "failed", user_message(self.error)
 
     @contextmanager
     def kept(self) -> Iterator[None]:

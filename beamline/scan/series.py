@@ -21,7 +21,6 @@ from beamline.core.stop import StopRequest
 from beamline.instrument.connect import clock_after, connect
 from beamline.scan.control import State
 from beamline.scan.dry_run import dry_run, refuse_violations
-from beamline.scan.exposures import SLICE
 from beamline.scan.live_process import Commands, reconstruct
 from beamline.scan.measurement import Measurement
 from beamline.scan.resume import (
@@ -34,6 +33,7 @@ from beamline.scan.resume import (
 )
 from beamline.scan.run import run_scan
 from beamline.scan.runs import describe
+from beamline.scan.waits import SLICE
 from beamline.storage.interrupted import scan_file
 from drivers.base.clock import SystemClock
 from drivers.in_beam import Ask

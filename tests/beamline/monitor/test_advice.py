@@ -23,6 +23,7 @@ PLACES = [
             "scan/recorder.py",
             "scan/frame_checks.py",
             "scan/flagged.py",
+            "scan/retakes.py",
             "scan/measurement.py",
             "cli/monitor.py",
         )
