@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -17,6 +18,7 @@ from beamline.core.errors import ConfigError
 from beamline.scan.ledger import LedgerError
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from tests.drivers.faults.rig import DARKS, FLATS, KINDS, VIEWS, Phase, Rig
+from tests.messages import SUFFIX, read
 
 TESTS = Path(__file__).parents[2]
 FIRST_VIEW = DARKS + FLATS
@@ -345,5 +347,7 @@ def applies() -> None:
     for elsewhere in (*OF_LINES, *OF_MOTION, *OF_CAMERA):
         path, name = elsewhere.test
         text = (TESTS / path).read_text(encoding="utf-8")
-        assert f"def {name}(" in text and elsewhere.words in text, elsewhere.fault
+        messages = read((TESTS / path).with_suffix(SUFFIX)).values()
+        assert f"def {name}(" in text, elsewhere.fault
+        assert any(elsewhere.words in words for words in (text, *chain(*messages))), elsewhere.fault
     assert VIEWS == 12
