@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -160,12 +161,12 @@ class Job:
 
 
 @contextmanager
-def refused(options: ReconOptions, by: str = "") -> Iterator[None]:
+def refused(path: Path | str, by: str = "") -> Iterator[None]:
     """Convert a ValueError to a DataError that names the file."""
     try:
         yield
     except ValueError as error:
-        raise DataError(f"{options.source.path} cannot be reconstructed{by}: {error}") from error
+        raise DataError(f"{path} cannot be reconstructed{by}: {error}") from error
 
 
 def compile_kernels(options: ReconOptions, geometry: Geometry, sink: Sink, clock: Clock) -> None:
@@ -176,7 +177,7 @@ def compile_kernels(options: ReconOptions, geometry: Geometry, sink: Sink, clock
     method, compiled = options.method, compilation_events(sink, clock)
     methods = method.alternatives if options.budget is not None else (method,)
     for candidate in methods if options.cluster is None else ():
-        with refused(options, f" by {candidate.name}"):
+        with refused(options.source.path, f" by {candidate.name}"):
             warm_up(candidate, geometry, device=options.device, on_kernel=compiled)
 
 
@@ -186,7 +187,7 @@ def runner_of(
     """Call `run_on` with the seed and device of the options. Errors of the method name the scan file."""
 
     def run(method: Method, views: Views, grid: Grid, control: RunControl) -> Reconstruction:
-        with refused(options, f" by {method.name}"):
+        with refused(options.source.path, f" by {method.name}"):
             return run_on(method, views, grid, options.seed, control, options.device, reconstruct, times)
 
     return run
@@ -209,7 +210,7 @@ def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedPro
 def _volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
     prepared, budget = job.prepared, job.options.budget
     if budget is not None:
-        with refused(job.options):
+        with refused(job.options.source.path):
             method, words = in_budget(
                 job.method, budget, prepared.geometry, prepared.box, job.channels.clock.now, job.channels.warn
             )

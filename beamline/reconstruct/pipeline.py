@@ -43,7 +43,7 @@ from beamline.reconstruct.scan_facts import MadeVolume, ReportContext, ScanFacts
 from beamline.reconstruct.slab_run import keeping
 from beamline.reconstruct.truth import fit_truth
 from beamline.storage.interrupted import next_step
-from beamline.storage.readers.open import NotReadyError, ScanSource
+from beamline.storage.readers.open import NotReadyError, ScanSource, SourceOptions
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writer_lock import WriterWatch
 from drivers.base.clock import Clock
@@ -73,9 +73,9 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
         options.source.open(
             follow=True
         ).close()  # raises an error for a file that is not a scan, before anything is compiled
-    _compile(options, channels, timing)
+    _compile(options.target.live_picture, channels, timing)
     with channels.stop_scope() as should_stop:
-        with _open(options, channels, timing) as source:
+        with _open(options.source, channels, timing) as source:
             follower = ScanFollower(options, source, sink, clock, channels.warn)
             if _watch(follower, clock, timing, should_stop):
                 follower.catch_up(should_stop)
@@ -90,7 +90,7 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
         def facts() -> ScanFacts:
             # Open the file again, because HDF5 may still have the texts from before the end of the scan.
             picture = options.target.live_picture.name if follower.snapshots.drawn else ""
-            with _open(options, channels, timing) as source:
+            with _open(options.source, channels, timing) as source:
                 return replace(facts_of(source), live_picture=picture)
 
         phases = Phases(sink, clock)  # a new `Channels`, because waiting for projections does not count as work
@@ -110,7 +110,7 @@ def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: Follow
         DataError: the scan died.
         KeyboardInterrupt: stopped before the end of the scan; nothing was written.
     """
-    with channels.stop_scope() as should_stop, _open(options, channels, timing) as source:
+    with channels.stop_scope() as should_stop, _open(options.source, channels, timing) as source:
         channels.sink(
             StateEntered(
                 "waiting",
@@ -132,7 +132,7 @@ def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: Follow
     return replace(options, follow=None)
 
 
-def _compile(options: ReconOptions, channels: Channels, timing: FollowTiming) -> None:
+def _compile(picture: Path, channels: Channels, timing: FollowTiming) -> None:
     """Compile the kernels of the fit before the first projection (only once on a computer). Then send the event
     `ready`, which names the picture that shows the volume. The kernels of the voxel refinement are compiled after the
     last projection.
@@ -148,7 +148,6 @@ def _compile(options: ReconOptions, channels: Channels, timing: FollowTiming) ->
         )
     )
     warm_up(R2(finish=0), on_kernel=compiled)
-    picture = options.target.live_picture
     message = (
         f"The live reconstruction is ready. To watch it, open {picture}: it shows slices from the eighth projection "
         f"on, later the volume, updated about every {timing.snapshot:g} s"
@@ -156,13 +155,13 @@ def _compile(options: ReconOptions, channels: Channels, timing: FollowTiming) ->
     sink(StateEntered("ready", message, {"picture": picture}, time=clock.now()))
 
 
-def _open(options: ReconOptions, channels: Channels, timing: FollowTiming) -> ScanSource:
+def _open(scan: SourceOptions, channels: Channels, timing: FollowTiming) -> ScanSource:
     """Wait until the file exists and is readable."""
     with suppress(NotReadyError):
-        return options.source.open(follow=True)
-    path = Path(options.source.path)
+        return scan.open(follow=True)
+    path = Path(scan.path)
     channels.sink(StateEntered("waiting", f"Waiting for {path}", time=channels.clock.now()))
-    return awaited(lambda: options.source.open(follow=True), path, channels.clock, timing.patience, timing.poll)
+    return awaited(lambda: scan.open(follow=True), path, channels.clock, timing.patience, timing.poll)
 
 
 def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_stop: Callable[[], bool]) -> bool:
@@ -255,7 +254,7 @@ def _for_method(
     Raises:
         ConfigError, DataError: there are too few projections, or too little disk space.
     """
-    with refused(options, f" by {options.method.name}"):
+    with refused(options.source.path, f" by {options.method.name}"):
         prepared = prepared.wanted(options.method.views_wanted(prepared.geometry))
     if options.uncertainty:
         refuse_views(options.method_for(prepared.geometry), prepared.geometry)
