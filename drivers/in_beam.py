@@ -56,9 +56,9 @@ class PlacedStage:
         """Name of the present place. Raises DeviceError."""
         return next((name for name in self._places.places if self._is_at(name)), None)
 
-    def put(self, place: str, beside: float = 0.0) -> None:
-        """Move to a place, or `beside` radians away from it. Raises DeviceError if the stage did not arrive."""
-        stage, speed, target = self._stage, self._places.speed, self._places.places[place] + beside
+    def put(self, place: str, offset: float = 0.0) -> None:
+        """Move to a place, or `offset` radians away from it. Raises DeviceError if the stage did not arrive."""
+        stage, speed, target = self._stage, self._places.speed, self._places.places[place] + offset
         try:
             if self._stands_at(target):
                 return

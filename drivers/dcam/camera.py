@@ -147,8 +147,8 @@ class DcamCamera:
                 frame = self._look()
                 if frame is not None:
                     return frame
-                left = deadline - self._clock.now()
-                if left <= 0:
+                remaining = deadline - self._clock.now()
+                if remaining <= 0:
                     problem = (
                         f"no frame arrived within {timeout:g} s of waiting for a trigger ({self._settings.trigger})"
                     )
@@ -157,7 +157,7 @@ class DcamCamera:
                         "shortest period"
                     )
                     raise DeviceTimeout(self.name, problem, advice=advice, state="It is still armed")
-                self._await_event(min(left, _WAIT_SLICE))
+                self._await_event(min(remaining, _WAIT_SLICE))
 
     def disarm(self) -> None:
         """Stop the capture and free the ring buffer. This is allowed in every state, and ends the wait of another

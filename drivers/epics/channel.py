@@ -167,20 +167,20 @@ class PvaChannel:
         return self._context if self._context is not None else self._errors.closed()
 
 
-def _is_silence(found: object) -> bool:
+def _is_silence(answer: object) -> bool:
     from p4p.client.thread import Disconnected
 
-    return isinstance(found, TimeoutError | Disconnected)
+    return isinstance(answer, TimeoutError | Disconnected)
 
 
-def _of_pva(found: Any) -> PvValue:
-    severity = int(getattr(found, "severity", 0))
-    choices: Any = getattr(getattr(found, "raw", None), "value", None)
+def _of_pva(answer: Any) -> PvValue:
+    severity = int(getattr(answer, "severity", 0))
+    choices: Any = getattr(getattr(answer, "raw", None), "value", None)
     if (labels := getattr(choices, "choices", None)) is not None:
         index = int(choices.index)
         return PvValue(float(index), labels[index] if index < len(labels) else "", severity)
     # str() of a p4p text begins with its time
-    return PvValue(str.__str__(found) if isinstance(found, str) else float(found), "", severity)
+    return PvValue(str.__str__(answer) if isinstance(answer, str) else float(answer), "", severity)
 
 
 _CA_SILENCE = (80, 192)  # ECA_TIMEOUT and ECA_DISCONN of caerr.h
@@ -221,12 +221,12 @@ class CaChannel:
         return self._ca if self._ca is not None else self._errors.closed()
 
 
-def _of_ca(found: Any) -> PvValue:
-    severity = int(found.severity)
-    if (labels := getattr(found, "enums", None)) is not None:
-        index = int(found)
+def _of_ca(answer: Any) -> PvValue:
+    severity = int(answer.severity)
+    if (labels := getattr(answer, "enums", None)) is not None:
+        index = int(answer)
         return PvValue(float(index), labels[index] if index < len(labels) else "", severity)
-    return PvValue(str(found) if isinstance(found, str) else float(found), "", severity)
+    return PvValue(str(answer) if isinstance(answer, str) else float(answer), "", severity)
 
 
 @cache

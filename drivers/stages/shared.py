@@ -60,9 +60,9 @@ class FoundSettings:
 def _settings_in(file: Path) -> dict[str, str]:
     """Original settings that an earlier program did not restore; empty if it did, or if the file is damaged."""
     with suppress(OSError, ValueError):
-        found = json.loads(file.read_text(encoding="utf-8"))
-        if isinstance(found, dict):
-            return {str(name): str(value) for name, value in found.items()}
+        stored = json.loads(file.read_text(encoding="utf-8"))
+        if isinstance(stored, dict):
+            return {str(name): str(value) for name, value in stored.items()}
     return {}
 
 
@@ -135,8 +135,8 @@ def until_standing(clock: Clock, look: Callable[[], Status], moves: Callable[[St
             moves according to a status.
     """
     deadline = clock.now() + timeout
-    while moves(status := look()) and (left := deadline - clock.now()) > 0:
-        clock.sleep(min(POLL, left))
+    while moves(status := look()) and (remaining := deadline - clock.now()) > 0:
+        clock.sleep(min(POLL, remaining))
     return status
 
 

@@ -111,7 +111,7 @@ class Travel:
         interval, least = abs(train.interval), least_interval(self.limits)
         close = train.n > 1 and interval < least
         uneven = train.n > 1 and interval % self.limits.interval_unit != 0
-        within = all(self.low <= at <= self.high for at in (train.start, train.end))
+        within = all(self.low <= position <= self.high for position in (train.start, train.end))
         if train.n < 1 or interval == 0 or close or uneven or not within:
             raise self.cannot_emit(train, advice="If pulses must be closer together, lower max_speed" if close else "")
 

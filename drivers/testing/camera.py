@@ -145,11 +145,11 @@ class CameraConformance:
     def test_software_triggers(self, bench: CameraBench) -> None:
         self._arm(bench, 3, trigger=TriggerSource.SOFTWARE)
         for k in range(3):
-            at = bench.clock.now()
+            triggered = bench.clock.now()
             bench.camera.software_trigger()
             frame = bench.camera.next_frame(timeout=1.0)
             assert frame.framestamp == k
-            assert frame.time == pytest.approx(at, abs=0.05)
+            assert frame.time == pytest.approx(triggered, abs=0.05)
             bench.clock.sleep(bench.camera.timing.min_period)
 
     def test_software_trigger_is_refused_where_it_means_nothing(self, bench: CameraBench) -> None:
@@ -181,9 +181,9 @@ class CameraConformance:
         self._arm(bench, 2, trigger=TriggerSource.INTERNAL)
         first, second = self._take(bench, 2)
         assert not np.shares_memory(first.counts, second.counts)
-        kept = first.counts.copy()
+        copy = first.counts.copy()
         second.counts[:] = 0
-        np.testing.assert_array_equal(first.counts, kept)
+        np.testing.assert_array_equal(first.counts, copy)
 
     def test_disarm_is_legal_in_every_state(self, bench: CameraBench) -> None:
         bench.camera.disarm()

@@ -198,8 +198,8 @@ class PiGcsAxis:
         command = f"CTO {self._output} {parameter} {value}"
         self._line.set(command)
         form = r"(\w+)" if parameter == 2 else NUMBER
-        asked = f"CTO? {self._output} {parameter}"
-        reply = self._line.ask(asked, rf"{self._output} {parameter} ?= ?{form}", f"{value}, as just set")[1]
+        query = f"CTO? {self._output} {parameter}"
+        reply = self._line.ask(query, rf"{self._output} {parameter} ?= ?{form}", f"{value}, as just set")[1]
         if parameter in (2, 3, 7):
             same = reply == value or (parameter != 2 and Fraction(reply) == int(value))
         else:

@@ -66,9 +66,9 @@ class PM16CLine:
     def until(self, look: Callable[[], T], good: Callable[[T], bool]) -> T:
         """The first good reply, or the last one within the time for a setting to take effect."""
         deadline = self._clock.now() + MEMORY
-        while not good(seen := look()) and self._clock.now() < deadline:
+        while not good(status := look()) and self._clock.now() < deadline:
             self._clock.sleep(LOOK)
-        return seen
+        return status
 
     def not_followed(self, command: str, reply: str, wanted: str) -> DeviceError:
         """The error for a read-back that differs from the set value."""

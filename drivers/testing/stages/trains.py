@@ -50,9 +50,9 @@ class Trains:
         bench.go(first + n * step + math.copysign(1.0, step))
         assert bench.pulse_counts() == [train.start + k * train.interval for k in range(n)]
         for k, pulse in enumerate(bench.pulses()):
-            asked = bench.stage.to_angle(train.start + k * train.interval)
-            assert pulse.angle == pytest.approx(asked, abs=math.radians(bench.count))
-            assert bench.line.angle_at(pulse.time) == pytest.approx(asked, abs=math.radians(bench.count))
+            expected_angle = bench.stage.to_angle(train.start + k * train.interval)
+            assert pulse.angle == pytest.approx(expected_angle, abs=math.radians(bench.count))
+            assert bench.line.angle_at(pulse.time) == pytest.approx(expected_angle, abs=math.radians(bench.count))
 
     @pytest.mark.parametrize("sign", [1, -1])
     def test_a_single_pulse_may_have_any_interval(self, bench: StageBench, sign: int) -> None:
@@ -67,9 +67,9 @@ class Trains:
         periods = [later - earlier for earlier, later in itertools.pairwise(times)]
         assert periods == pytest.approx([0.05] * 20, rel=1e-3)
 
-    @pytest.mark.parametrize(("steps", "given"), SCRIPTS.values(), ids=SCRIPTS)
+    @pytest.mark.parametrize(("steps", "pulse_counts"), SCRIPTS.values(), ids=SCRIPTS)
     def test_every_train_gives_its_pulses_until_it_is_over(
-        self, bench: StageBench, steps: Sequence[Step], given: Sequence[int]
+        self, bench: StageBench, steps: Sequence[Step], pulse_counts: Sequence[int]
     ) -> None:
         trains = []
         for step in steps:
@@ -80,7 +80,9 @@ class Trains:
                 bench.stage.arm(trains[-1])
             else:
                 bench.go(step)
-        expected = [train.start + train.interval * k for train, n in zip(trains, given, strict=True) for k in range(n)]
+        expected = [
+            train.start + train.interval * k for train, n in zip(trains, pulse_counts, strict=True) for k in range(n)
+        ]
         assert bench.pulse_counts() == expected
 
     def test_a_train_under_which_the_stage_is_stopped_goes_on_with_the_next_move(self, bench: StageBench) -> None:
