@@ -48,9 +48,9 @@ class SimulatedMonochromator:
             return
         scene = self._scene_at(energy)
         deadline = self._clock.now() + self._settle
-        while (left := deadline - self._clock.now()) > 0:
+        while (remaining := deadline - self._clock.now()) > 0:
             self._check()
-            self._clock.sleep(min(POLL, left))
+            self._clock.sleep(min(POLL, remaining))
         self._show(scene)
         self._energy = energy
 

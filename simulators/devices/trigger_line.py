@@ -55,8 +55,8 @@ class TriggerLine:
     def next_after(self, time: float) -> Pulse | None:
         """The first pulse strictly later than `time`, even if it is in the future; None if there is none."""
         with self._lock:
-            at = bisect_right(self._pulses, time, key=attrgetter("time"))
-            return self._pulses[at] if at < len(self._pulses) else None
+            index = bisect_right(self._pulses, time, key=attrgetter("time"))
+            return self._pulses[index] if index < len(self._pulses) else None
 
     def attach_angle(self, angle: Callable[[float], float]) -> None:
         """Set the function of the sample's true angle: radians at a time. A later call replaces it."""

@@ -68,8 +68,8 @@ _ALL = {**_OURS, **{name: _entry_of(effect) for name, effect in _PLUGGED.items()
 def _place(name: str) -> tuple[Domain, bool, int]:
     """Position of an effect: first by its domain, and within the domain after all effects that it must follow."""
 
-    def depth(of: str) -> int:
-        return max((1 + depth(before) for before in _ALL[of].follows if before in _ALL), default=0)
+    def depth(name: str) -> int:
+        return max((1 + depth(before) for before in _ALL[name].follows if before in _ALL), default=0)
 
     return _ALL[name].domain, name in FINAL, depth(name)
 

@@ -173,9 +173,9 @@ class AnomalyLabel:
     region: tuple[int, int, int, int]
     which: int = 0
 
-    def joined(self, other: AnomalyLabel) -> AnomalyLabel:
+    def joined(self, second: AnomalyLabel) -> AnomalyLabel:
         """This label with a region that includes the region of the other label."""
-        (top, below, left, right), region = self.region, other.region
+        (top, below, left, right), region = self.region, second.region
         joined = min(top, region[0]), max(below, region[1]), min(left, region[2]), max(right, region[3])
         return AnomalyLabel(self.kind, joined, self.which)
 

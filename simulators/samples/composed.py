@@ -182,10 +182,10 @@ def _solids(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume
     entries = [(f"{where}.solids[{i}]", entry) for i, entry in enumerate(keys.solids or ())]
     used = {*mapping, *(key for _, entry in entries if isinstance(entry, Mapping) for key in entry)}
     modules = in_folders("simulators.samples", "SOLID_KEYS")
-    if found := [module for key, module in modules.items() if key in used]:
-        sample: Sample = import_module(found[0]).phantom(where, entries, keys.materials, beam)
+    if names_of_modules := [module for key, module in modules.items() if key in used]:
+        sample: Sample = import_module(names_of_modules[0]).phantom(where, entries, keys.materials, beam)
         return sample
-    grey = [_grey(at, entry) for at, entry in entries]
+    grey = [_grey(place, entry) for place, entry in entries]
     return Phantom.of([solid for solid, _ in grey], [name for _, name in grey])
 
 
@@ -206,11 +206,11 @@ def _read(
     name: str, module: str, where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None
 ) -> Sample:
     """A phantom that the module reads from a file, for example with `volume_sample` of VolumeSettings."""
-    found = import_module(module)
-    settings = build(getattr(found, f"{name.title()}Settings"), where, mapping)
+    module_of_sample = import_module(module)
+    settings = build(getattr(module_of_sample, f"{name.title()}Settings"), where, mapping)
     if read is None:
         raise ValueError(f"{settings.file} cannot be read: no reader of such files was given")
-    sample: Sample = getattr(found, f"{name}_sample")(settings, read)
+    sample: Sample = getattr(module_of_sample, f"{name}_sample")(settings, read)
     return sample
 
 

@@ -62,10 +62,10 @@ class BeamHardening(ImageEffect):
     ratios: tuple[Positive, ...] | None = None
 
     def __post_init__(self) -> None:
-        given = self.energies if self.ratios is None else self.ratios
-        if given is None or (self.energies is not None and self.ratios is not None):
+        per_energy = self.energies if self.ratios is None else self.ratios
+        if per_energy is None or (self.energies is not None and self.ratios is not None):
             raise ValueError(f"give either energies in keV or ratios of attenuations, got {self}")
-        if len(given) != len(self.weights) or not self.weights:
+        if len(per_energy) != len(self.weights) or not self.weights:
             raise ValueError(f"there must be one weight for each energy or ratio, and at least one, got {self}")
         if not sum(self.weights) > 0:
             raise ValueError(f"one of the weights must be positive, got {self.weights}")

@@ -145,7 +145,7 @@ class LostBeam(ImageEffect, Anomaly):
         if self.seconds is None:
             return 1 - self.share if within(self.views, shot) else 0.0
         # In seconds of this exposure, so that rounding cannot remove more than all photons.
-        begin, end = (at - shot.elapsed for at in self.seconds)
+        begin, end = (moment - shot.elapsed for moment in self.seconds)
         off = min(end, shot.exposure) - max(begin, 0.0)
         return (1 - self.share) * max(off, 0.0) / shot.exposure
 
@@ -279,8 +279,8 @@ class NarrowField(ImageEffect, Anomaly):
 
     def _between(self, place: NDArray[np.float64], width: float) -> NDArray[np.float64]:
         # The part of the source that is not covered. The two edges cover the source from opposite ends.
-        one, other = (exposed_share(edge, self.penumbra) for edge in (width / 2 - place, width / 2 + place))
-        return np.maximum(one + other - 1, 0.0)
+        near_edge, far_edge = (exposed_share(edge, self.penumbra) for edge in (width / 2 - place, width / 2 + place))
+        return np.maximum(near_edge + far_edge - 1, 0.0)
 
 
 def _lit_fully(intensity: NDArray[np.float64], less: float = 0.0) -> tuple[int, int]:

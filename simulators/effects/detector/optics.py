@@ -79,10 +79,10 @@ def discrete_gaussian(variance: float) -> NDArray[np.float64]:
     steepness = 0.5 / variance
     if variance < 1:  # narrower than the sampling; a steeper law, because the continuous one would lose variance
         steepness = brentq(lambda b: 2 * float(offsets**2 @ taps(b)) - variance, 0.4, 1 + math.log(2 / variance))
-    kept = taps(steepness)
-    beyond = 2 * np.cumsum(kept[::-1])[::-1]  # intensity at this tap and beyond
-    kept = kept[beyond >= NEGLIGIBLE]
-    return kept / (2 * kept.sum() - kept[0])
+    weights = taps(steepness)
+    beyond = 2 * np.cumsum(weights[::-1])[::-1]  # intensity at this tap and beyond
+    weights = weights[beyond >= NEGLIGIBLE]
+    return weights / (2 * weights.sum() - weights[0])
 
 
 @njit(cache=True, nogil=True)
@@ -157,14 +157,14 @@ class FlatStructure(ImageEffect):
         """Share of the intensity that remains, float64 [row, col]."""
         pixel_um = shot.detector.pitch / shot.binning * 1e3
         row0, col0, rows, cols = shot.roi
-        left = np.ones((rows, cols))
+        transmission = np.ones((rows, cols))
         rng = fixed_rng(self.name, self.seed)
         for row, col, radius, depth in self._specks(rng, pixel_um):
-            _draw_speck(left, row - row0, col - col0, radius, depth)
+            _draw_speck(transmission, row - row0, col - col0, radius, depth)
         for row, col, angle, length, depth in self._scratches(rng, pixel_um):
-            _draw_scratch(left, row - row0, col - col0, angle, length, self.scratch_width_um / pixel_um, depth)
+            _draw_scratch(transmission, row - row0, col - col0, angle, length, self.scratch_width_um / pixel_um, depth)
         n = shot.binning
-        return left if n == 1 else left.reshape(rows // n, n, cols // n, n).mean(axis=(1, 3))
+        return transmission if n == 1 else transmission.reshape(rows // n, n, cols // n, n).mean(axis=(1, 3))
 
     def _specks(self, rng: np.random.Generator, pixel_um: float) -> Reals:
         """Sensor row and column, radius in sensor pixels and depth; float64 [speck, 4]."""
@@ -179,35 +179,43 @@ class FlatStructure(ImageEffect):
         return draw * (*SENSOR_SHAPE, np.pi, self.scratch_length_um / pixel_um, 2 * self.scratch_depth)
 
 
-def _draw_speck(left: Reals, row: float, col: float, radius: float, depth: float) -> None:
-    """Multiply a round Gaussian into `left`; row and column may lie outside."""
-    rows = _window(row, REACH * radius, left.shape[0])
-    cols = _window(col, REACH * radius, left.shape[1])
+def _draw_speck(transmission: Reals, row: float, col: float, radius: float, depth: float) -> None:
+    """Multiply a round Gaussian into `transmission`; row and column may lie outside."""
+    rows = _window(row, REACH * radius, transmission.shape[0])
+    cols = _window(col, REACH * radius, transmission.shape[1])
     if rows.size and cols.size:
-        down, across = (np.exp(-0.5 * ((at - middle) / radius) ** 2) for at, middle in ((rows, row), (cols, col)))
-        left[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1] *= 1 - depth * down[:, None] * across
+        down, across = (
+            np.exp(-0.5 * ((positions - middle) / radius) ** 2) for positions, middle in ((rows, row), (cols, col))
+        )
+        transmission[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1] *= 1 - depth * down[:, None] * across
 
 
-def _draw_scratch(left: Reals, row: float, col: float, angle: float, length: float, width: float, depth: float) -> None:
-    """Multiply a straight line with a Gaussian across it and at its ends into `left`; only pixels near it are touched.
+def _draw_scratch(
+    transmission: Reals, row: float, col: float, angle: float, length: float, width: float, depth: float
+) -> None:
+    """Multiply a straight line with a Gaussian across it and at its ends into `transmission`, at pixels near it only.
 
     The line is followed along the axis that it is closer to, and drawn across that axis at each of its pixels.
     """
     if abs(np.sin(angle)) < abs(np.cos(angle)):
-        left, row, col, angle = left.T, col, row, np.pi / 2 - angle
-    along, beside = np.sin(angle), np.cos(angle)
-    steps = _window(row, abs(along) * length / 2 + REACH * width, left.shape[0])
+        transmission, row, col, angle = transmission.T, col, row, np.pi / 2 - angle
+    along, across = np.sin(angle), np.cos(angle)
+    steps = _window(row, abs(along) * length / 2 + REACH * width, transmission.shape[0])
     # Along the axis, an inclined line of width w has the width w / cos, at most √2 w.
     reach = int(np.ceil(REACH * width * np.sqrt(2)))
-    middle = np.rint(col + (steps - row) * beside / along).astype(np.int64)
-    whole = 2 * reach >= left.shape[1]  # a line wider than the frame covers each column of the frame once
-    at = np.arange(left.shape[1]) + 0 * middle[:, None] if whole else middle[:, None] + np.arange(-reach, reach + 1)
-    dy, dx = (steps - row)[:, None], at - col
-    t, s = dy * along + dx * beside, dx * along - dy * beside  # pixels along the line and across
+    middle = np.rint(col + (steps - row) * across / along).astype(np.int64)
+    whole = 2 * reach >= transmission.shape[1]  # a line wider than the frame covers each column of the frame once
+    columns = (
+        np.arange(transmission.shape[1]) + 0 * middle[:, None]
+        if whole
+        else middle[:, None] + np.arange(-reach, reach + 1)
+    )
+    dy, dx = (steps - row)[:, None], columns - col
+    t, s = dy * along + dx * across, dx * along - dy * across  # pixels along the line and across
     beyond = np.maximum(np.abs(t) - length / 2, 0.0)
     loss = depth * np.exp(-0.5 * (s**2 + beyond**2) / width**2)
-    inside = (at >= 0) & (at < left.shape[1])
-    left[np.broadcast_to(steps[:, None], at.shape)[inside], at[inside]] *= 1 - loss[inside]
+    inside = (columns >= 0) & (columns < transmission.shape[1])
+    transmission[np.broadcast_to(steps[:, None], columns.shape)[inside], columns[inside]] *= 1 - loss[inside]
 
 
 def _window(middle: float, reach: float, extent: int) -> NDArray[np.int64]:
@@ -273,18 +281,18 @@ def gauss_rule(points: Reals, weights: Reals, n: int) -> tuple[Reals, Reals]:
     By Lanczos' recursion (Golub & Welsch 1969, Math. Comp. 23:221; Gautschi 2004)."""
     scale = float(np.abs(points).max()) or 1.0
     basis = [np.sqrt(weights / weights.sum())]
-    diagonal, beside = [], []
+    diagonal, off_diagonal = [], []
     for _ in range(min(n, points.size)):
         following = points / scale * basis[-1]
         diagonal.append(float(basis[-1] @ following))
         for _ in range(2):  # twice is enough (Parlett 1980)
             for vector in basis:
                 following = following - (vector @ following) * vector
-        beside.append(float(np.linalg.norm(following)))
-        if beside[-1] < 1e-12:
+        off_diagonal.append(float(np.linalg.norm(following)))
+        if off_diagonal[-1] < 1e-12:
             break
-        basis.append(following / beside[-1])
+        basis.append(following / off_diagonal[-1])
     size = len(diagonal)
-    jacobi = np.diag(diagonal) + np.diag(beside[: size - 1], 1) + np.diag(beside[: size - 1], -1)
+    jacobi = np.diag(diagonal) + np.diag(off_diagonal[: size - 1], 1) + np.diag(off_diagonal[: size - 1], -1)
     nodes, vectors = np.linalg.eigh(jacobi)
     return nodes * scale, vectors[0] ** 2 * weights.sum()

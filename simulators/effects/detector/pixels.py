@@ -54,9 +54,9 @@ class HotPixels(ImageEffect):
     seed: Whole = 0
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        at, even = places(self.name, self.seed, self.fraction, shot)
+        pixels, even = places(self.name, self.seed, self.fraction, shot)
         rates = -self.rate * np.log1p(-even)
-        np.add.at(image, at, frame_rng(self.name, shot).poisson(rates * shot.exposure))
+        np.add.at(image, pixels, frame_rng(self.name, shot).poisson(rates * shot.exposure))
         return image
 
 
@@ -76,8 +76,8 @@ class DeadPixels(ImageEffect):
     seed: Whole = 0
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        at, _ = places(self.name, self.seed, self.fraction, shot)
-        pixels, times = np.unique(np.ravel_multi_index(at, image.shape), return_counts=True)
+        drawn, _ = places(self.name, self.seed, self.fraction, shot)
+        pixels, times = np.unique(np.ravel_multi_index(drawn, image.shape), return_counts=True)
         flat = image.reshape(-1)
         flat[pixels] = flat[pixels] * (1 - times / shot.binning**2) + times * self.charge
         return image

@@ -111,11 +111,11 @@ class Floaters(ImageEffect, Anomaly):
         detector = shot.detector
         for which in range(self.count):
             distance, size, height = (rng.uniform(*ends) for ends in (self.distance, self.size, self.heights))
-            depth, at, passing = self.depth * rng.uniform(0.5, 1.0), rng.uniform(0, 2 * math.pi), rng.uniform()
-            u, b = distance * math.cos(shot.angle - at), -distance * math.sin(shot.angle - at)
+            depth, direction, passing = self.depth * rng.uniform(0.5, 1.0), rng.uniform(0, 2 * math.pi), rng.uniform()
+            u, b = distance * math.cos(shot.angle - direction), -distance * math.sin(shot.angle - direction)
             if loose:
                 first, after = self.views or (0, 0)
-                u = math.copysign(self.speed, math.cos(at)) * (shot.view - first - passing * (after - first))
+                u = math.copysign(self.speed, math.cos(direction)) * (shot.view - first - passing * (after - first))
                 b = 0.0 if abs(u) <= distance else math.inf
             if b == math.inf or detector.sod + b <= 0:
                 continue

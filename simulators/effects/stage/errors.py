@@ -93,19 +93,19 @@ def came_forwards(angle_at: AngleAt, time: float) -> bool:
     """True if the stage turns forwards at `time` (s), or did so in its last move before."""
     here = angle_at(time)
 
-    def elsewhere(ago: float) -> bool:
-        return abs(angle_at(time - ago) - here) > STILL
+    def elsewhere(seconds: float) -> bool:
+        return abs(angle_at(time - seconds) - here) > STILL
 
-    ago = LOOK
-    while not elsewhere(ago):
-        if ago > HISTORY:
+    seconds = LOOK
+    while not elsewhere(seconds):
+        if seconds > HISTORY:
             return True
-        ago *= 2
-    still = ago / 2 if ago > LOOK else 0.0
-    while ago - still > LOOK:  # the step back may have skipped the last move
-        middle = (still + ago) / 2
-        still, ago = (still, middle) if elsewhere(middle) else (middle, ago)
-    return angle_at(time - ago) < here
+        seconds *= 2
+    still = seconds / 2 if seconds > LOOK else 0.0
+    while seconds - still > LOOK:  # the step back may have skipped the last move
+        middle = (still + seconds) / 2
+        still, seconds = (still, middle) if elsewhere(middle) else (middle, seconds)
+    return angle_at(time - seconds) < here
 
 
 @dataclass(frozen=True)

@@ -198,11 +198,11 @@ def by_mass(name: str, density: float, parts: Mapping[str, float]) -> Material:
     return Material(name, density, tuple(sorted(total.items())))
 
 
-def by_volume(name: str, one: Material, other: Material, share: float) -> Material:
-    """A mixture of two materials: the fraction `share` of the volume is `one`, the remaining volume is `other`."""
-    masses = (share * one.density, (1 - share) * other.density)
+def by_volume(name: str, first: Material, second: Material, share: float) -> Material:
+    """A mixture of two materials: the fraction `share` of the volume is `first`, the remaining volume is `second`."""
+    masses = (share * first.density, (1 - share) * second.density)
     total: dict[int, float] = {}
-    for mass, material in zip(masses, (one, other), strict=True):
+    for mass, material in zip(masses, (first, second), strict=True):
         for z, fraction in material.fractions:
             total[z] = total.get(z, 0.0) + mass / sum(masses) * fraction
     return Material(name, sum(masses), tuple(sorted(total.items())))
@@ -319,12 +319,14 @@ def known(name: str) -> Material | None:
 
 
 def _own(where: str, name: str, settings: Any) -> Material:
-    given = build(_Properties, where, settings)
+    properties = build(_Properties, where, settings)
     base = known(name)
-    density = given.density if given.density is not None else base.density if base else None
-    if density is None or (base is None and given.formula is None):
+    density = properties.density if properties.density is not None else base.density if base else None
+    if density is None or (base is None and properties.formula is None):
         raise SceneError(f"{where}: {name!r} is not a known material; give formula and density (g/cm3)")
     with located(where):
-        if base is None or given.formula is not None:
-            base = of_formula(name, str(given.formula), density)
-        return replace(base, density=density, state_of_charge=given.state_of_charge, edge_shift_ev=given.edge_shift_ev)
+        if base is None or properties.formula is not None:
+            base = of_formula(name, str(properties.formula), density)
+        return replace(
+            base, density=density, state_of_charge=properties.state_of_charge, edge_shift_ev=properties.edge_shift_ev
+        )

@@ -200,7 +200,7 @@ def phantom(where: str, entries: Sequence[tuple[str, Any]], materials: Any, beam
         SceneError: a wrong entry. ValueError: the beam's energies do not suit the materials.
     """
     palette = palette_of(f"{where}.materials", materials)
-    return sample_of([_part(at, entry, palette) for at, entry in entries], beam, palette.filters)
+    return sample_of([_part(place, entry, palette) for place, entry in entries], beam, palette.filters)
 
 
 def _part(where: str, entry: Any, palette: Palette) -> Part:

@@ -82,8 +82,8 @@ def light(
     if spectrum.energies.size <= _A_FEW or not attenuations:
         return spectrum
     attenuation = np.stack([material(spectrum.energies) for material in attenuations], axis=1)
-    kept, weights = fewer(attenuation, spectrum.weights, thickness, TOLERANCE / 5)
-    return Spectrum(spectrum.energies[kept], weights)
+    chosen, weights = fewer(attenuation, spectrum.weights, thickness, TOLERANCE / 5)
+    return Spectrum(spectrum.energies[chosen], weights)
 
 
 def _converged(
@@ -179,27 +179,27 @@ def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float
     lengths = np.append(thickness * 2.0 ** (-np.arange(STEPS) / 3), 0.0)
     rays = (lengths[:, None, None] * np.concatenate(ways)).reshape(-1, n_materials)
     through = np.exp(-rays @ attenuation.T)
-    light = through @ weights
+    signal = through @ weights
     try:
-        exact, _ = nnls(through, light)
+        exact, _ = nnls(through, signal)
     except RuntimeError:  # too nearly dependent (as around an edge), so the search does not converge
         return np.arange(weights.size), weights
     enough = np.flatnonzero(exact)
     through = through[:, enough]
     chosen: list[int] = []
     shares = np.zeros(0)
-    missing = light
+    missing = signal
     while len(chosen) < enough.size:
         pull = through.T @ missing
         pull[chosen] = -np.inf
         chosen.append(int(np.argmax(pull)))
-        shares, _ = nnls(through[:, chosen], light)
+        shares, _ = nnls(through[:, chosen], signal)
         shares /= shares.sum()
-        missing = light - through[:, chosen] @ shares
+        missing = signal - through[:, chosen] @ shares
         if np.abs(missing).max() <= tolerance:
             break
     else:
         return np.arange(weights.size), weights
-    kept = enough[chosen][shares > 0]
-    order = np.argsort(kept)
-    return kept[order], shares[shares > 0][order]
+    chosen_energies = enough[chosen][shares > 0]
+    order = np.argsort(chosen_energies)
+    return chosen_energies[order], shares[shares > 0][order]

@@ -248,10 +248,10 @@ class VolumeSettings:
         if self.window is not None and not self.window[0] < self.window[1]:
             raise ValueError(f"window must be (low, high) in the file's values, got {self.window}")
         factors = ("scale", "attenuation_max", "largest_line_integral")
-        given = [name for name in factors if getattr(self, name) is not None]
-        if len(given) > 1:
-            raise ValueError(f"{' and '.join(given)} exclude each other; give one of them")
-        if self.window is not None and not given:
+        factors_given = [name for name in factors if getattr(self, name) is not None]
+        if len(factors_given) > 1:
+            raise ValueError(f"{' and '.join(factors_given)} exclude each other; give one of them")
+        if self.window is not None and not factors_given:
             raise ValueError("a window needs attenuation_max, largest_line_integral or scale")
 
 

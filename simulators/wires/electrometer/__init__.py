@@ -52,10 +52,10 @@ class ElectrometerWire(BytesWire):
         command = line.decode("ascii", errors="replace").strip().upper()
         self.heard.append(command)
         if command == "READ?":
-            at, self.readings = self.readings, self.readings + 1
-            if at in self._spoilt:
-                self._send(self._spoilt[at] + self._end)
-            elif at not in self._silent:
+            number, self.readings = self.readings, self.readings + 1
+            if number in self._spoilt:
+                self._send(self._spoilt[number] + self._end)
+            elif number not in self._silent:
                 now = self.clock.now() + self.latency
                 reading = f"{self._current(now):+.6E}A,{now - self._started:+.6E},{0:+.6E}"
                 self._send(reading.encode() + self._end)

@@ -155,10 +155,10 @@ class GcsAxis(MovedAxis):
             raise GcsError(93)
         if not self._servo:
             raise GcsError(5)
-        at = {"FRF": 0.0, "FNL": self.build.low, "FPL": self.build.high}[kind]
+        position = {"FRF": 0.0, "FNL": self.build.low, "FPL": self.build.high}[kind]
         self.referenced, self._referencing = False, True
-        self._begin(round(at * self.per_degree), REFERENCE_VELOCITY)
-        self._at_end = self._found
+        self._begin(round(position * self.per_degree), REFERENCE_VELOCITY)
+        self._at_end = self._reference_reached
 
     def brake(self) -> None:
         """HLT: decelerate and stop at a whole count."""
@@ -217,7 +217,7 @@ class GcsAxis(MovedAxis):
         self._hit = self.move.direction
         self._target = (self.move.target - self._zero) / self.per_degree
 
-    def _found(self) -> None:
+    def _reference_reached(self) -> None:
         self._referencing = False
         if self.build.reference_fails:
             self.error = 45

@@ -80,11 +80,11 @@ def crossings(window: Window, progress: TrainProgress, begin: float, end: float)
     edge = window.stop if sign == window.sign else window.start
     room = ahead(edge) if window.sign else math.inf
     while True:
-        at = progress.anchor + (progress.index + sign) * window.step
-        if ahead(at) > min(room, reach) + SLACK:
+        position = progress.anchor + (progress.index + sign) * window.step
+        if ahead(position) > min(room, reach) + SLACK:
             break
         progress = replace(progress, index=progress.index + sign)
-        yield Crossing(end if ahead(at) > reach else at, True, progress)
+        yield Crossing(end if ahead(position) > reach else position, True, progress)
     if room < reach:
         yield Crossing(edge, False, TrainProgress())
 
@@ -170,9 +170,9 @@ class WiredOutput:
         self._schedule(move, now, self._settle(now))
 
     def _window(self) -> Window:
-        at, scale = self.settings, self._per_degree
-        start, stop = at.start * scale + self._zero, at.stop * scale + self._zero
-        return Window(at.step * scale, start, stop, self._zero, self._firmware.first_pulse)
+        settings, scale = self.settings, self._per_degree
+        start, stop = settings.start * scale + self._zero, settings.stop * scale + self._zero
+        return Window(settings.step * scale, start, stop, self._zero, self._firmware.first_pulse)
 
     def _settle(self, now: float) -> list[Pulse]:
         """Keep past changes and drop future ones; returns the edges to come of pulses that have begun."""
@@ -201,8 +201,8 @@ class WiredOutput:
             time, edge = self._noticed(move.time_at(crossing.position), now), None
             if crossing.pulse:
                 if time > high_until and number not in firmware.lost:
-                    at = time if bool(self.settings.polarity) is firmware.rising else time + firmware.width
-                    edge = Pulse(at, move.position(at) * 2 * math.pi / (360.0 * self._per_degree))
+                    edge_time = time if bool(self.settings.polarity) is firmware.rising else time + firmware.width
+                    edge = Pulse(edge_time, move.position(edge_time) * 2 * math.pi / (360.0 * self._per_degree))
                 high_until, number = time + firmware.width, number + 1
             self._coming.append(_Coming(time, crossing, edge))
 

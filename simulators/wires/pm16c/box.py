@@ -190,11 +190,11 @@ class PM16CBox:
         if any(self.channels[c].motor.moving() for c in (*wanted.replace("-", ""), *self.mapped)):
             raise Refused(Pm16cError.COMMAND)
         places = list(self.mapped)
-        for at, c in enumerate(wanted):
+        for slot, c in enumerate(wanted):
             if c in places:
-                places[places.index(c)] = places[at]
+                places[places.index(c)] = places[slot]
             if c != "-":
-                places[at] = c
+                places[slot] = c
         self.mapped = "".join(places)
 
     def start(self, c: str, target: int) -> None:

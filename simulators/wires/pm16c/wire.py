@@ -151,10 +151,10 @@ class PM16CController(BytesWire):
             self.box.errors |= Pm16cError.COMMAND
 
     def _reply(self, text: str) -> None:
-        at, self.queries = self.queries, self.queries + 1
-        if at in self._garbled:
+        query, self.queries = self.queries, self.queries + 1
+        if query in self._garbled:
             self._send(b"\xfe\x00" + text[::-1].encode("ascii") + END)
-        elif at not in self._silent:
+        elif query not in self._silent:
             self._send(text.encode("ascii") + END)
 
 
