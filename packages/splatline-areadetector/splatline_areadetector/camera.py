@@ -297,11 +297,11 @@ class AreaDetectorCamera:
 
     def _await_silence(self) -> None:
         """Drop frames of an earlier run that may still arrive from the network."""
-        silent, seen = self._clock.now(), self._stream_items
+        silent, items_before = self._clock.now(), self._stream_items
         while self._clock.now() - silent < _SETTLED:
             self._clock.sleep(LOOK_EVERY)
-            if self._stream_items != seen:
-                silent, seen = self._clock.now(), self._stream_items
+            if self._stream_items != items_before:
+                silent, items_before = self._clock.now(), self._stream_items
 
     _stream_items = 0
 
@@ -350,9 +350,9 @@ class AreaDetectorCamera:
             return
         if self._origin is None:
             self._origin = item.unique_id
-        at = item.time - self._settings.exposure - self._own.readout
+        exposed_from = item.time - self._settings.exposure - self._own.readout
         try:
-            frame = CameraFrame(item.counts(), item.unique_id - self._origin, at)
+            frame = CameraFrame(item.counts(), item.unique_id - self._origin, exposed_from)
         except ValueError as error:
             self._fail(f"a frame is damaged: {error}")
             return

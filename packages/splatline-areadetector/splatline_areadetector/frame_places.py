@@ -54,11 +54,11 @@ class Seen:
     frame: Any = None
     count_restarts: int = 0
 
-    def repeats(self, other: Seen, *, is_last: bool) -> bool:
+    def repeats(self, second: Seen, *, is_last: bool) -> bool:
         """Whether a frame is the same as another frame with this number, sent again: at once, or later with the same
         time."""
-        is_same = self.phase == other.phase and (is_last or self.time == other.time)
-        return is_same and np.array_equal(self.pixels, other.pixels)
+        is_same = self.phase == second.phase and (is_last or self.time == second.time)
+        return is_same and np.array_equal(self.pixels, second.pixels)
 
 
 class Basis(Enum):
@@ -66,7 +66,7 @@ class Basis(Enum):
 
     GIVEN = "the frame that ride.first_id states"
     NUMBERS = "the frame whose number follows the number of the last frame before the block"
-    COUNTER = "the frame whose number follows from the camera's counter"
+    COUNTER = "the frame with the number that was calculated from the camera's counter"
     WAITED = "the first frame that arrived"
     UNKNOWN = "the first frame that arrived, although others may have come before it"
 

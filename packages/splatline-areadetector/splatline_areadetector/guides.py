@@ -379,8 +379,8 @@ class TomoscanGuide:
         serial, kind = self._collecting(frame.time)
         if kind is None or self._kinds is None:
             return BlockKey(serial, kind)
-        told = self._kinds(frame)
-        return BlockKey(serial, kind if told == UNKNOWN_KIND else told.kind)
+        told_kind = self._kinds(frame)
+        return BlockKey(serial, kind if told_kind == UNKNOWN_KIND else told_kind.kind)
 
     def _collecting(self, seconds: float) -> tuple[int, FrameKind | None]:
         """The number of the status message that was valid at this time of the camera's IOC, and the kind it names."""

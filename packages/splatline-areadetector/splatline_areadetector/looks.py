@@ -39,8 +39,8 @@ def check(config: RideConfig) -> list[str]:
 def _taken(stream: FrameStream) -> tuple[list[ArrayFrame], str]:
     clock, frames = SystemClock(), list[ArrayFrame]()
     end = clock.now() + SECONDS
-    while (left := end - clock.now()) > 0:
-        item = stream.next(left)
+    while (remaining := end - clock.now()) > 0:
+        item = stream.next(remaining)
         if isinstance(item, Refused):
             return frames, item.why
         if isinstance(item, ArrayFrame) and not item.is_current:
@@ -53,8 +53,8 @@ def _size(frame: ArrayFrame | None) -> str:
         return "none yet"
     window, codec = frame.window, f", {frame.codec}" if frame.codec else ""
     binned = f", binned {window.binning[0]} x {window.binning[1]}" if window.binning != (1, 1) else ""
-    at = f", from row {window.offset[0]}, column {window.offset[1]}" if window.offset != (0, 0) else ""
-    return f"{window.shape[0]} x {window.shape[1]} {frame.dtype}{codec}{binned}{at}"
+    window_words = f", from row {window.offset[0]}, column {window.offset[1]}" if window.offset != (0, 0) else ""
+    return f"{window.shape[0]} x {window.shape[1]} {frame.dtype}{codec}{binned}{window_words}"
 
 
 def _arrival(frames: list[ArrayFrame]) -> str:

@@ -108,7 +108,7 @@ def ready_of(config: RideConfig, plan: RidePlan, first: ArrayFrame, runs: Path) 
     settings = CameraSettings(plan.exposure(FrameKind.PROJECTION), TriggerSource.EXTERNAL, None, binning[0])
     timeline = timeline_of(plan, shape, config.storage.preview_bin, _free(runs))
     optics, known = config.optics, not np.isnan(plan.angles).any()
-    asked = {
+    plan_values = {
         "scheme": plan.angle_source,
         "exposure_s": plan.exposure(FrameKind.PROJECTION),
         **({"angles_deg": np.degrees(plan.angles).tolist()} if known else {}),
@@ -123,7 +123,7 @@ def ready_of(config: RideConfig, plan: RidePlan, first: ArrayFrame, runs: Path) 
         exposure=plan.exposure(FrameKind.PROJECTION),
         period=plan.period,
         axis_col=optics.axis_col,
-        plan=json_of(asked),
+        plan=json_of(plan_values),
         config=resolved_yaml(config),
         devices={"areadetector": _described(config, first)},
         saturation=float(2**bits - 1),

@@ -169,5 +169,7 @@ class RunFrames:
 
 
 def _read(file: ScanFile, row: int) -> PublishedFrame:
-    kind, angle, at, exposure = (file.values(path, row) for path in (KIND, ANGLE, TIME, COUNT_TIME))
-    return PublishedFrame(file.data[row], row + 1, FrameKind(int(kind)), float(angle), float(at), float(exposure))
+    kind, angle, exposed_at, exposure = (file.values(path, row) for path in (KIND, ANGLE, TIME, COUNT_TIME))
+    return PublishedFrame(
+        file.data[row], row + 1, FrameKind(int(kind)), float(angle), float(exposed_at), float(exposure)
+    )

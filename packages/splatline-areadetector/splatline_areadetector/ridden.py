@@ -234,11 +234,11 @@ class RiddenFrames:
     def _unknown(self, frame: ArrayFrame, place: Unknown) -> Frame | None:
         """A frame that cannot be assigned, stored as an invalid row if it has the size of the others. The first frame
         of each cause gives a message, and all are listed at the end."""
-        kept = "stored as an invalid row" if place.fits else "not stored"
-        frames = self._unplaced.setdefault(f"{place.why} ({kept})", [])
+        fate = "stored as an invalid row" if place.fits else "not stored"
+        frames = self._unplaced.setdefault(f"{place.why} ({fate})", [])
         frames.append(frame.unique_id)
         if len(frames) == 1:
-            self._warn(f"Frame {frame.unique_id} is {kept}, because {place.why}.")
+            self._warn(f"Frame {frame.unique_id} is {fate}, because {place.why}.")
         if not place.fits or (counts := self._counts(frame)) is None:
             return None
         self._in_block += bool(self._in_block)
@@ -254,11 +254,11 @@ class RiddenFrames:
     def _other_size(self, frame: ArrayFrame) -> str:
         """Why the file is closed: a frame of another size or type."""
         assert self._last is not None
-        (before, dtype), (after, other) = self._last.kind, frame.kind
+        (before, dtype), (after, dtype_after) = self._last.kind, frame.kind
         return (
-            f"frames from number {frame.unique_id} on are {after.shape[0]} x {after.shape[1]} {other}, before "
+            f"frames from number {frame.unique_id} on are {after.shape[0]} x {after.shape[1]} {dtype_after}, before "
             f"{before.shape[0]} x {before.shape[1]} {dtype}"
-            + ("" if (before.shape, dtype) != (after.shape, other) else ", and show another part of the sensor")
+            + ("" if (before.shape, dtype) != (after.shape, dtype_after) else ", and show another part of the sensor")
         )
 
     def _frame(self, frame: ArrayFrame, counts: NDArray[np.uint16], place: FramePosition) -> Frame:
@@ -312,12 +312,12 @@ class RiddenFrames:
         for i, block in enumerate(self._plan.blocks):
             if missing := self._sorter.missing(i):
                 noun, angles = block.kind.name.lower(), self._plan.angles
-                at = ""
+                angle_words = ""
                 if block.kind is FrameKind.PROJECTION and not np.isnan(angles).any():
                     first, last = (math.degrees(angles[missing[end]]) for end in (0, -1))
-                    at = f" (from {first:.4g}° to {last:.4g}°)"
+                    angle_words = f" (from {first:.4g}° to {last:.4g}°)"
                 are = "is" if len(missing) == 1 else "are"
-                words.append(f"{len(missing)} of {block.n} {noun}s {are} missing: {spans(missing)}{at}.")
+                words.append(f"{len(missing)} of {block.n} {noun}s {are} missing: {spans(missing)}{angle_words}.")
         words.append(self._first_or_last(ended))
         for why, ids in self._unused.items():
             words.append(f"{count(len(ids), 'frame')} arrived ({spans(ids)}) but could not be used: {why}.")

@@ -185,7 +185,7 @@ def _with_given(plan: RidePlan, given: Images, shape: tuple[int, int]) -> RidePl
 
 def load_given(darks: str | None, flats: str | None) -> Images:
     """Darks and flats from files, rounded to counts. Raises ConfigError if they cannot be counts of a camera."""
-    given = {}
+    images_of_kinds = {}
     for kind, name in ((FrameKind.DARK, darks), (FrameKind.FLAT, flats)):
         if name is None:
             continue
@@ -198,8 +198,8 @@ def load_given(darks: str | None, flats: str | None) -> Images:
             raise ConfigError(
                 f"--{kind.name.lower()}s {name} must hold counts, numbers from 0 to 65535. Nothing was recorded."
             )
-        given[kind] = counts.astype(np.uint16)
-    return given
+        images_of_kinds[kind] = counts.astype(np.uint16)
+    return images_of_kinds
 
 
 def opened(config: RideConfig, held: ExitStack) -> tuple[FrameStream, Guide, Counters]:
