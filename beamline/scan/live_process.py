@@ -356,7 +356,8 @@ class Standby:
 
 
 def reconstruct(command: Sequence[str], log: Path, sink: Sink, stop: StopRequest) -> Mapping[str, Any] | None:
-    """Reconstruct a complete scan in a separate process. Return the values of the event `done`; None if it failed."""
+    """Reconstruct a complete scan in a separate process. Return the values of the event `done`; None if the
+    reconstruction failed."""
     process = LiveReconstruction(command, log, sink, what="reconstruction", silence=math.inf, low_priority=False)
     try:
         return process.finish(lambda: stop.stopping, lambda: stop.aborting)

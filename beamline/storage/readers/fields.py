@@ -309,8 +309,14 @@ NXTOMO: tuple[Entry, ...] = (
 EXCHANGE: tuple[Entry, ...] = (
     Entry("implements", "shown by `info`"),
     Entry("exchange/data", "projections; the attribute `axes` states the order of the dimensions (default theta:y:x)"),
-    Entry("exchange/data_white", "flats, in the order of `axes`, or of exchange/data"),
-    Entry("exchange/data_dark", "darks, in the order of `axes`, or of exchange/data"),
+    Entry(
+        "exchange/data_white",
+        "flats; its own attribute `axes` states the order of the dimensions (default: the order of exchange/data)",
+    ),
+    Entry(
+        "exchange/data_dark",
+        "darks; its own attribute `axes` states the order of the dimensions (default: the order of exchange/data)",
+    ),
     Entry(
         "exchange/theta",
         "angle of each projection, in its `units` (default degrees). If theta is missing, `start` and `step` in "

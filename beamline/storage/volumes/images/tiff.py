@@ -96,7 +96,9 @@ class TiffFolderVolume:
             stated_shape = facts.get("shape")
             shape = shape_of([facts.get("slices"), *(stated_shape[-2:] if isinstance(stated_shape, list) else ())])
         except ValueError as error:
-            raise DataError(f"{path} cannot be read as a volume ({error}): it was changed.") from error
+            raise DataError(
+                f"{path} cannot be read as a volume ({error}), because its files were changed after the export."
+            ) from error
         there = {item.name for item in path.iterdir()}
         first = next((z for z in range(shape[0]) if _slice(path, z).name not in there), None)
         if first is not None:
