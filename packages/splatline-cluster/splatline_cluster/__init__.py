@@ -151,12 +151,12 @@ def connected(spec: str, first_worker_s: float = _CONNECT_TIMEOUT) -> Iterator[C
 def _require_same_version(client: Client, spec: str) -> None:
     """Raise ConfigError if a worker does not have this package, or has another version of splatline."""
     # Run a function of Python, because a worker without this package has none of ours.
-    found = client.run(resolve_name, "splatline_cluster:recon.__version__", on_error="return")
-    others = {worker: there for worker, there in found.items() if there != recon.__version__}
+    versions = client.run(resolve_name, "splatline_cluster:recon.__version__", on_error="return")
+    others = {worker: there for worker, there in versions.items() if there != recon.__version__}
     for worker, there in others.items():
         lacks = isinstance(there, Exception)
         what = f"splatline or splatline-cluster cannot be loaded ({there})" if lacks else f"splatline is {there}"
         raise ConfigError(
-            f"--cluster {spec}: {len(others)} of {len(found)} workers cannot be used: {what} at {worker}. Start the "
+            f"--cluster {spec}: {len(others)} of {len(versions)} workers cannot be used: {what} at {worker}. Start the "
             f"workers where splatline {recon.__version__} and splatline-cluster are installed. Nothing was read."
         )

@@ -126,8 +126,8 @@ def recon(
             else:
                 lines, weights = weighted_lines(counted)
                 use = reconstruction.DataUse(weights)
-                made = reconstruction.reconstruct(lines, counted.geometry, method, use=use, seed=seed)
-                volume, chosen = made.volume, len(made.history)
+                result = reconstruction.reconstruct(lines, counted.geometry, method, use=use, seed=seed)
+                volume, chosen = result.volume, len(result.history)
         except ValueError as error:
             raise DataError(f"{file} cannot be reconstructed: {error}. Nothing was written.") from error
         write_volume(

@@ -34,16 +34,16 @@ class Rod:
     mu: float
 
 
-def _at(turn: int) -> tuple[float, float]:
+def _position(turn: int) -> tuple[float, float]:
     """Position of the rod number `turn`; neighbouring rods are 60° apart."""
     return 13 * math.cos(turn * math.pi / 3), 13 * math.sin(turn * math.pi / 3)
 
 
 RODS = (
     Rod(24.0, (0.0, 0.0), 1.0, WATER),
-    *(Rod(radius, _at(turn), 3.0, 0.0) for turn, radius in enumerate((1.5, 2.5, 4.0, 5.5))),
-    Rod(5.5, _at(4), -1.0, AIR - WATER),
-    Rod(5.5, _at(5), -1.0, TEFLON - WATER),
+    *(Rod(radius, _position(turn), 3.0, 0.0) for turn, radius in enumerate((1.5, 2.5, 4.0, 5.5))),
+    Rod(5.5, _position(4), -1.0, AIR - WATER),
+    Rod(5.5, _position(5), -1.0, TEFLON - WATER),
 )
 
 
@@ -184,11 +184,11 @@ def weighted_lines(emission: Emission) -> tuple[F32, F32]:
     too low. Lines with survival 0 have weight 0.
     """
     survival, zeros = emission.survival, np.zeros_like(emission.counts)
-    seen = survival > 0
+    exposed = survival > 0
     # Smooth counts over survival, because efficiency and attenuation differ from line to line, and activity hardly.
-    level = gaussian_filter(np.where(seen, emission.counts, 0), _SMOOTH, mode="nearest")
-    shape = gaussian_filter(survival * seen, _SMOOTH, mode="nearest")
+    level = gaussian_filter(np.where(exposed, emission.counts, 0), _SMOOTH, mode="nearest")
+    shape = gaussian_filter(survival * exposed, _SMOOTH, mode="nearest")
     mean = np.maximum(level * np.divide(survival, shape, out=1 + zeros, where=shape > 0), emission.background)
-    lines = np.divide(emission.counts - emission.background, survival, out=zeros.copy(), where=seen)
-    weights = np.divide(survival**2, np.maximum(mean, _FEWEST_OF_A_LINE), out=zeros, where=seen)
+    lines = np.divide(emission.counts - emission.background, survival, out=zeros.copy(), where=exposed)
+    weights = np.divide(survival**2, np.maximum(mean, _FEWEST_OF_A_LINE), out=zeros, where=exposed)
     return lines, weights

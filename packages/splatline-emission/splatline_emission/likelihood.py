@@ -78,16 +78,19 @@ def _passes(emission: Emission, grid: Grid, subsets: int) -> Iterator[_Pass]:
     if not 1 <= subsets <= views:
         raise ValueError(f"subsets must be 1 to {views}, the number of projections, got {subsets}")
     whole = Projector(emission.geometry, grid).plain  # because expectation maximisation needs a matrix >= 0
-    parts = [(some, whole.subset(some)) for some in (np.arange(first, views, subsets) for first in range(subsets))]
-    sensitivities = [projector.adjoint(emission.survival[some]) for some, projector in parts]
+    parts = [
+        (view_numbers, whole.subset(view_numbers))
+        for view_numbers in (np.arange(first, views, subsets) for first in range(subsets))
+    ]
+    sensitivities = [projector.adjoint(emission.survival[view_numbers]) for view_numbers, projector in parts]
     least = _LEAST * max(float(each.max()) for each in sensitivities)
     x = np.where(sum(sensitivities) > least, np.float32(1), np.float32(0))
     x *= np.float32(emission.counts.sum(dtype=np.float64) / sum(float(np.vdot(x, each)) for each in sensitivities))
     while True:
         likelihood = squares = 0.0
-        for (some, projector), sensitivity in zip(parts, sensitivities, strict=True):
-            counts, survival = emission.counts[some], emission.survival[some]
-            mean = survival * projector.forward(x) + emission.background[some]
+        for (view_numbers, projector), sensitivity in zip(parts, sensitivities, strict=True):
+            counts, survival = emission.counts[view_numbers], emission.survival[view_numbers]
+            mean = survival * projector.forward(x) + emission.background[view_numbers]
             if blind := np.count_nonzero(counts[mean <= 0]):
                 raise ValueError(
                     f"{blind} lines have counts although their mean is 0: they miss the grid, or their survival is 0. "
@@ -125,8 +128,8 @@ def passes_by_halves(emission: Emission, grid: Grid, subsets: int, most: int, rn
     taken = rng.binomial(counts.astype(np.int64), 0.5).astype(np.float32)
     survival, background = emission.survival * np.float32(0.5), emission.background * np.float32(0.5)
     half = Emission(taken, emission.geometry, survival, background)
-    other = counts - taken - background
-    lines = np.divide(other, survival, out=np.zeros_like(other), where=survival > 0)
+    remaining = counts - taken - background
+    lines = np.divide(remaining, survival, out=np.zeros_like(remaining), where=survival > 0)
     whole, least = Projector(emission.geometry, grid).plain, math.inf
     for n, done in enumerate(islice(_passes(half, grid, subsets), most), start=1):
         error = _error_of_images(np.where(survival > 0, lines - whole.forward(done.activity), np.float32(0)))

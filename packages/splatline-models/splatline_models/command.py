@@ -94,8 +94,8 @@ def voxelise(volume: Path, output: Path, voxel: float | None, box: Box | None, a
             grid = box_grid(model.record.volume.grid, voxel, box)
         except ValueError as error:
             raise click.UsageError(f"{error}. Nothing was written.") from error
-        made = voxelised(model, grid, answer.counting("slices"))
-        write_volume(output, replace(model.record, volume=made, time=answer.clock.now()))
+        voxels = voxelised(model, grid, answer.counting("slices"))
+        write_volume(output, replace(model.record, volume=voxels, time=answer.clock.now()))
         facts = {"output": output, "shape": grid.shape, "voxel": grid.voxel_size}
         answer.done(facts, f"output  {output}, {' x '.join(map(str, grid.shape))} voxels")
 

@@ -135,6 +135,6 @@ def surface(data: F32, grid: Grid, level: float) -> Mesh:
         rim = np.moveaxis(block, axis, 0)
         rim[[0, -1]] = -np.abs(rim[[0, -1]])  # the material ends at the face
     block = np.copysign(np.maximum(np.abs(block), _APART * np.abs(block).max()), block)
-    at, faces, _, _ = marching_cubes(block, 0.0)
-    vertices = (at[:, ::-1] - 1) * grid.spacing[::-1] + np.asarray(grid.first[::-1])
+    points, faces, _, _ = marching_cubes(block, 0.0)
+    vertices = (points[:, ::-1] - 1) * grid.spacing[::-1] + np.asarray(grid.first[::-1])
     return Mesh(vertices.astype(np.float32), faces.astype(np.int32))

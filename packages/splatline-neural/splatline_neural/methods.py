@@ -144,8 +144,8 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
             stacklevel=2,
         )
     used = np.setdiff1d(np.arange(geometry.n_views), problem.views.held_out)
-    given = problem.views.masked()
-    data, weights = given.data, given.weights
+    measured = problem.views.masked()
+    data, weights = measured.data, measured.weights
     grid = Grid.for_fit(geometry, problem.grid, wider=problem.wide)
     unit = density_unit(first_volume(data[used], geometry.select(used), grid).data)
     if unit <= 0 or not (data[used] > 0).any():
@@ -189,7 +189,7 @@ class _Fit:
 
     def run(self, used: NDArray[np.intp]) -> None:
         method, now = self.method, self.control.now
-        lit = [int(view) for view in used if self.views.usable(int(view)).any()]
+        usable_views = [int(view) for view in used if self.views.usable(int(view)).any()]
         order: list[int] = []
         seconds = math.inf if method.seconds is None else method.seconds
         reported = -math.inf
@@ -197,7 +197,7 @@ class _Fit:
             share = max(self.step / method.steps, (now() - self.begin) / seconds)
             if self.step and share >= 1:
                 break
-            order = order or self.rng.permutation(lit).tolist()
+            order = order or self.rng.permutation(usable_views).tolist()
             self._advance(order.pop(), method.rate * (_DROP if share >= _DROP_AT else 1.0))
             if now() - reported > 0.1:
                 reported = now()
@@ -246,15 +246,15 @@ class _Fit:
         low, high = self.views.grid.edges
         edge = (high - low).max()
         z, y, x = (
-            np.clip((at - first) / edge, 0, (last - first) / edge).astype(np.float32)
-            for at, first, last in zip(grid.coordinates(), low[::-1], high[::-1], strict=True)
+            np.clip((coordinates - first) / edge, 0, (last - first) / edge).astype(np.float32)
+            for coordinates, first, last in zip(grid.coordinates(), low[::-1], high[::-1], strict=True)
         )
         out, lines = np.empty(grid.shape, np.float32).reshape(-1, x.size), max(1, CHUNK // x.size)
         for first in range(0, len(out), lines):
-            at = np.arange(first, min(first + lines, len(out)))
-            points = np.empty((at.size, x.size, 3), np.float32)
-            points[..., 0], points[..., 1], points[..., 2] = x, y[at % y.size, None], z[at // y.size, None]
-            out[at] = self.network(self._tensor(points)).cpu().numpy()
+            indices = np.arange(first, min(first + lines, len(out)))
+            points = np.empty((indices.size, x.size, 3), np.float32)
+            points[..., 0], points[..., 1], points[..., 2] = x, y[indices % y.size, None], z[indices // y.size, None]
+            out[indices] = self.network(self._tensor(points)).cpu().numpy()
         return out.reshape(grid.shape)
 
 

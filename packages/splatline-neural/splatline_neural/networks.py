@@ -48,10 +48,10 @@ class HashGrid(nn.Module):
         corners = torch.tensor([[(n >> k) & 1 for k in range(3)] for n in range(8)], device=points.device)
         for level, side in enumerate(self.sides.tolist()):
             first, size = int(self.firsts[level]), int(self.firsts[level + 1] - self.firsts[level])
-            at = points[..., None, :] * (side - 2) + 0.5
-            low = at.floor()
+            scaled = points[..., None, :] * (side - 2) + 0.5
+            low = scaled.floor()
             corner = low.long() + corners
-            weight = torch.where(corners > 0, at - low, 1 - (at - low)).prod(-1)
+            weight = torch.where(corners > 0, scaled - low, 1 - (scaled - low)).prod(-1)
             x, y, z = corner.unbind(-1)
             hashed = (x ^ (y * _PRIMES[0]) ^ (z * _PRIMES[1])) & (size - 1)
             entry = x + side * (y + side * z) if side**3 <= size else hashed
@@ -90,8 +90,8 @@ class LineAttention(nn.Module):
         lines, samples, width = x.shape
         pairs = x.reshape(lines * samples // _SEGMENT, _SEGMENT, width)
         mixed = self.mix(self.norms[0](pairs)).unflatten(-1, (3, _HEADS, _HEAD))
-        asked, keys, values = mixed.unbind(2)
-        scores = (asked[:, :, None] * keys[:, None]).sum(-1) / math.sqrt(_HEAD) + self.places
+        queries, keys, values = mixed.unbind(2)
+        scores = (queries[:, :, None] * keys[:, None]).sum(-1) / math.sqrt(_HEAD) + self.places
         shares = scores.softmax(2)
         pairs = pairs + self.out((shares[..., None] * values[:, None]).sum(2).flatten(-2))
         y = self.norms[1](pairs)
@@ -213,10 +213,10 @@ def drawn(rng: np.random.Generator, candidates: NDArray[np.bool_], count: int, w
         side = min(side, rows, cols)
         top, left = rng.integers(0, rows - side + 1, windows), rng.integers(0, cols - side + 1, windows)
         within = np.arange(side)
-        at = (top[:, None, None] + within[:, None]) * cols + left[:, None, None] + within
-        places.append(at.ravel())
+        pixels = (top[:, None, None] + within[:, None]) * cols + left[:, None, None] + within
+        places.append(pixels.ravel())
         free = candidates.copy()
-        free.reshape(-1)[at.ravel()] = False
+        free.reshape(-1)[pixels.ravel()] = False
     left_over = np.flatnonzero(free)
     if left_over.size > count:
         left_over = left_over[rng.integers(0, left_over.size, count)]

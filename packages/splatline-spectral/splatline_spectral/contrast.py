@@ -120,11 +120,15 @@ class XafsCurve:
 def line_integrals(signal: Reals, flat: Reals) -> Reals:
     """-log(signal / flat), [row, col], from counts above the dark level. +inf: nothing was transmitted. NaN: the flat
     is dark, too, or a value is not finite."""
-    lit = np.minimum(_LIT, _LIT_SHARE * flat)
+    least_signal = np.minimum(_LIT, _LIT_SHARE * flat)
     out = np.full(np.broadcast_shapes(signal.shape, flat.shape), np.nan)
     known = np.isfinite(signal) & (flat > 0) & (flat < np.inf)
-    np.log(np.divide(flat, signal, where=known & (signal > lit), out=out), where=known & (signal > lit), out=out)
-    out[known & (signal <= lit)] = np.inf
+    np.log(
+        np.divide(flat, signal, where=known & (signal > least_signal), out=out),
+        where=known & (signal > least_signal),
+        out=out,
+    )
+    out[known & (signal <= least_signal)] = np.inf
     return out
 
 
@@ -174,11 +178,11 @@ def _level(frame: Reals, mask: NDArray[np.bool_]) -> tuple[float, float]:
     sides = frame[:-2, 1:-1] + frame[2:, 1:-1] + frame[1:-1, :-2] + frame[1:-1, 2:]
     corners = frame[:-2, :-2] + frame[:-2, 2:] + frame[2:, :-2] + frame[2:, 2:]
     curved[1:-1, 1:-1] = 4 * inner - 2 * sides + corners
-    left = curved[binary_erosion(mask, np.ones((3, 3)))]
-    left = left[np.isfinite(left)]
-    if left.size < ENOUGH:
-        left = curved[mask & np.isfinite(curved)]
-    noise = float(np.median(np.abs(left)) / 0.6745 / 6) if left.size >= FEWEST else math.nan
+    residual = curved[binary_erosion(mask, np.ones((3, 3)))]
+    residual = residual[np.isfinite(residual)]
+    if residual.size < ENOUGH:
+        residual = curved[mask & np.isfinite(curved)]
+    noise = float(np.median(np.abs(residual)) / 0.6745 / 6) if residual.size >= FEWEST else math.nan
     return float(values[known].mean()), noise
 
 
@@ -263,14 +267,14 @@ def _step(rest: Reals, basis: Reals) -> tuple[int, float]:
         rest: [n], residual after the projection on `basis`.
         basis: orthonormal, [n, k].
     """
-    at = np.arange(2, rest.size - 1)
-    above, held = (np.cumsum(values[::-1], axis=0)[::-1][at] for values in (rest, basis))
-    free = np.maximum(rest.size - at - (held**2).sum(axis=1), 1e-9)  # squared norm outside of the basis
+    candidates = np.arange(2, rest.size - 1)
+    above, held = (np.cumsum(values[::-1], axis=0)[::-1][candidates] for values in (rest, basis))
+    free = np.maximum(rest.size - candidates - (held**2).sum(axis=1), 1e-9)  # squared norm outside of the basis
     gain = np.where(above > 0, above**2 / free, 0.0)
-    best, left = int(np.argmax(gain)), rest.size - basis.shape[1] - 1
-    noise = max(float(rest @ rest) - float(gain[best]), 0.0) / left
+    best, freedom = int(np.argmax(gain)), rest.size - basis.shape[1] - 1
+    noise = max(float(rest @ rest) - float(gain[best]), 0.0) / freedom
     t = math.sqrt(float(gain[best]) / noise) if noise > 0 else math.inf
-    return int(at[best]), min(float(stdtr(left, -t)) * at.size, 1.0)
+    return int(candidates[best]), min(float(stdtr(freedom, -t)) * candidates.size, 1.0)
 
 
 def _white_line(energies: Reals, absorption: Reals, edge: int, noise: float) -> float | None:

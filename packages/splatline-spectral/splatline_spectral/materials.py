@@ -134,33 +134,34 @@ def materials(files: tuple[Path, ...], spectra: Path, output: Path, as_json: boo
             moves: Sequence[Any] = ()
             if values["register"]:
                 views, moves = recon.register_energies(views, answer.counting("registering the scans"))
-            found = recon.fit_materials(views)
+            fitted = recon.fit_materials(views)
             if states:
-                found = recon.fit_share(views, found, (states[0], states[1]))
+                fitted = recon.fit_share(views, fitted, (states[0], states[1]))
         except ValueError as error:
             raise ConfigError(f"The scans cannot be fitted: {error}. Nothing was written.") from error
-        for name, path, densities in zip(table.names, outputs, found.densities, strict=True):
+        for name, path, densities in zip(table.names, outputs, fitted.densities, strict=True):
             record = replace(
-                bare_record(scans[0], densities), volume=recon.Volume(densities, found.grid), length_unit="mm",
+                bare_record(scans[0], densities), volume=recon.Volume(densities, fitted.grid), length_unit="mm",
                 raw_file=str(scans[0].resolve()), title=f"volume fraction of {name}", kind=VoxelKind.SHARE,
                 time=answer.clock.now(),
                 parameters={
                     "method": "materials", "material": name, "scans": ", ".join(str(each.resolve()) for each in scans),
-                    "tv_weights": found.weights, "displacements": np.array([astuple(move) for move in moves]),
+                    "tv_weights": fitted.weights, "displacements": np.array([astuple(move) for move in moves]),
                 },
-                metrics={"residual": found.residual},
+                metrics={"residual": fitted.residual},
             )  # fmt: skip
             write_volume(path, record)
-        facts = {"outputs": dict(zip(table.names, outputs, strict=True)), "residual": found.residual}
+        facts = {"outputs": dict(zip(table.names, outputs, strict=True)), "residual": fitted.residual}
         written = [f"{name:<12}{path}" for name, path in zip(table.names, outputs, strict=True)]
         answer.done(facts, *written, *map(_move, moves))
 
 
 def _move(move: Any) -> str:
     """A line for the terminal on the displacement of the sample in a scan."""
-    at = ", ".join(f"{1e3 * getattr(move, axis):+.2f}" for axis in "xyz")
+    shifts = ", ".join(f"{1e3 * getattr(move, axis):+.2f}" for axis in "xyz")
     return (
-        f"displaced   {at} µm along x, y, z, turned {math.degrees(move.turn):+.3f}°, magnified {move.magnification:.4f}"
+        f"displaced   {shifts} µm along x, y, z, turned {math.degrees(move.turn):+.3f}°, magnified "
+        f"{move.magnification:.4f}"
     )
 
 

@@ -128,7 +128,7 @@ def _of_scans(scans: Sequence[Path]) -> tuple[Reals, tuple[int, int], Read]:
         with open_scan(scans[n]) as source:
             dark = _mean(source, FrameKind.DARK, part)
             flat = _mean(source, FrameKind.FLAT, part) - dark
-            views = _some(source, FrameKind.PROJECTION)
+            views = _sampled_rows(source, FrameKind.PROJECTION)
             flats = source.table.exposures[source.table.flats]
             scale = np.nanmean(source.table.exposures[views]) / np.nanmean(flats)
             flat = flat * (scale if np.isfinite(scale) else 1.0)
@@ -138,7 +138,7 @@ def _of_scans(scans: Sequence[Path]) -> tuple[Reals, tuple[int, int], Read]:
     return np.array(energies), shapes.pop(), read
 
 
-def _some(source: ScanSource, kind: FrameKind) -> NDArray[np.int64]:
+def _sampled_rows(source: ScanSource, kind: FrameKind) -> NDArray[np.int64]:
     frames = source.table.of_kind(kind)
     if not frames.size:
         raise DataError(f"{source.path} has no {kind.name.lower()}s. Nothing was written.")
@@ -150,7 +150,7 @@ def _frame(source: ScanSource, index: int, part: FramePart) -> Reals:
 
 
 def _mean(source: ScanSource, kind: FrameKind, part: FramePart) -> Reals:
-    return np.asarray(np.mean([_frame(source, index, part) for index in _some(source, kind)], axis=0))
+    return np.asarray(np.mean([_frame(source, index, part) for index in _sampled_rows(source, kind)], axis=0))
 
 
 def counts_in(values: Any) -> Reals:
@@ -182,16 +182,16 @@ def _series(path: Path, order: NDArray[np.intp], energies: Reals, regions: Contr
     rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     # Read only these rows and columns, and their neighbours.
     part = slice(max(int(rows[0]) - 1, 0), int(rows[-1]) + 2), slice(max(int(cols[0]) - 1, 0), int(cols[-1]) + 2)
-    seen = ContrastRegions(regions.inside[part], None if regions.around is None else regions.around[part])
-    return Series(path.name, order.size, ((float(energies[n]), read(int(n), part)) for n in order), seen)
+    regions_of_part = ContrastRegions(regions.inside[part], None if regions.around is None else regions.around[part])
+    return Series(path.name, order.size, ((float(energies[n]), read(int(n), part)) for n in order), regions_of_part)
 
 
 def _regions(path: Path, shape: tuple[int, int], region: PixelBox | None, around: PixelBox | None) -> ContrastRegions:
     inside = _mask(shape, region or (0, shape[0], 0, shape[1]))
-    beside = None if around is None else _mask(shape, around) & ~inside
-    if beside is not None and not beside.any():
+    outside = None if around is None else _mask(shape, around) & ~inside
+    if outside is not None and not outside.any():
         raise ConfigError(f"{path}: --around has no pixel outside of --region. Nothing was written.")
-    return ContrastRegions(inside, beside)
+    return ContrastRegions(inside, outside)
 
 
 def _mask(shape: tuple[int, int], box: PixelBox) -> NDArray[np.bool_]:

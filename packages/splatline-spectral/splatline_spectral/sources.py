@@ -100,13 +100,13 @@ class _EnergyScan:
         number = max(self.scan.scene.scan.darks, 1)
         dark = np.mean([self._counts(n, beam=False, sample=False) for n in range(number)], axis=0)
         for energy in energies.tolist():
-            here = self._at(energy)
+            here = self._at_energy(energy)
             flat = np.mean([here._counts(number + k, sample=False) for k in range(_FLATS)], axis=0) - dark
             signal = here._counts(number + _FLATS) - dark
             number += _FLATS + 1
             yield energy, line_integrals(signal, flat)
 
-    def _at(self, energy: float) -> _EnergyScan:
+    def _at_energy(self, energy: float) -> _EnergyScan:
         """The same scan at that energy."""
         beam = replace(self.beam, energy_kev=energy)
         attenuations = [
@@ -164,8 +164,8 @@ def _regions(sample: Mixture, material: str, scan: Scan) -> ContrastRegions:
         raise ValueError("it is not in the field of view")
     inside = own >= _THICK * own.max()
     near = binary_dilation(own > 0, iterations=min(_NEAR, max(own.shape))) & (own == 0)
-    matter = near & (thickness != 0).any(axis=0)
-    return ContrastRegions(inside, matter if matter.any() else near, float(own[inside].mean()))
+    with_material = near & (thickness != 0).any(axis=0)
+    return ContrastRegions(inside, with_material if with_material.any() else near, float(own[inside].mean()))
 
 
 def _no_filters(name: str) -> Any:

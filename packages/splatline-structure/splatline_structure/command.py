@@ -189,25 +189,25 @@ def structure(
             )
             for path in paths
         ]  # fmt: skip
-        seen = []
+        measured_volumes = []
         for path, read in zip(paths, reads, strict=True):
             try:
-                seen.append(seen_in(path, read, answer, **values))
+                measured_volumes.append(seen_in(path, read, answer, **values))
             except ValueError as error:
                 raise DataError(f"{path} cannot be measured: {error}. Nothing was written.") from error
-        _write(seen, compare, output, values, answer)
+        _write(measured_volumes, compare, output, values, answer)
 
 
-def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any], answer: Answer) -> None:
+def _write(measured_volumes: list[Seen], compare: bool, output: Path, values: dict[str, Any], answer: Answer) -> None:
     """Write the folder, and print the numbers."""
     from beamline.core.events import json_of
     from beamline.report.html import Picture
     from splatline_structure import intervals, pictures, results
 
-    first = seen[0]
+    first = measured_volumes[0]
     table = first.found.intervals
     shown = pictures.pictures_of(first.found, first.volume, first.grid, first.read)
-    title = f"{seen[1].path.name} minus {first.path.name}" if compare else f"Structure of {first.path.name}"
+    title = f"{measured_volumes[1].path.name} minus {first.path.name}" if compare else f"Structure of {first.path.name}"
     settings = {
         "volume": first.path,
         **{name: value for name, value in values.items() if value is not None},
@@ -218,19 +218,21 @@ def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any]
             **settings, "volume": each.path, "box": each.voxels(each.read.slices),
             "box_of_all": each.voxels(each.read.asked), "limit": each.read.limit_sentence,
         })
-        for each in seen
+        for each in measured_volumes
     ]  # fmt: skip
     if compare:
-        table = {name: intervals.difference(each, seen[1].found.intervals[name]) for name, each in table.items()}
-    if len(seen) > 1:
+        table = {
+            name: intervals.difference(each, measured_volumes[1].found.intervals[name]) for name, each in table.items()
+        }
+    if len(measured_volumes) > 1:
         curves = {
-            name: [each.found.intervals[name] for each in seen]
+            name: [each.found.intervals[name] for each in measured_volumes]
             for name, interval in first.found.intervals.items()
             if not interval.why_not
         }
-        at = [float(each.read.record.parameters.get("time_s", k)) for k, each in enumerate(seen)]
+        times = [float(each.read.record.parameters.get("time_s", k)) for k, each in enumerate(measured_volumes)]
         if curves:
-            drawn = pictures.curves_of(curves, at, "volume")
+            drawn = pictures.curves_of(curves, times, "volume")
             shown.insert(0, Picture("Numbers of all volumes", "Each value with its interval.", drawn))
     particles = first.found.structure.particles
     undecided = (
@@ -238,11 +240,11 @@ def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any]
         f"{count(particles.label.size, 'particle')}, of which {int(particles.cut.sum())} touch a face of the box."
     )
     limits = [f"{first.path}: {first.read.limit_sentence}"] if first.read.limit_sentence else []
-    box = " and ".join(each.voxels(each.read.slices) for each in (seen if compare else [first]))
+    box = " and ".join(each.voxels(each.read.slices) for each in (measured_volumes if compare else [first]))
     texts = {
         "report.html": results.page(title, undecided, limits, shown, table, settings),
         "numbers.csv": results.numbers_table(table, box, first.voxels(first.read.asked)),
-        "structure.json": json_of(states[0] if len(seen) == 1 else {"states": states}),
+        "structure.json": json_of(states[0] if len(measured_volumes) == 1 else {"states": states}),
         "particles.csv": results.particles_table(particles, first.grid),
     }
     labels: dict[str, Any] = {

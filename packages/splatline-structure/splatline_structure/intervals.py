@@ -119,7 +119,7 @@ def measured_structure(
     count: int,
     spacing: Spacing,
     rules: Rules,
-    tell: Callable[[int, int], None] = lambda n, of: None,
+    tell: Callable[[int, int], None] = lambda n, total: None,
 ) -> MeasuredStructure:
     """The structure of a volume, with the intervals of its numbers.
 
@@ -243,41 +243,41 @@ def _judged(kind: str, interval: Interval) -> Interval:
     return replace(interval, low=low, high=high, why_not=why if high - low > WIDEST * abs(interval.value) else "")
 
 
-def with_all_slices(found: MeasuredStructure, slabs: Iterable[F32]) -> MeasuredStructure:
+def with_all_slices(measured: MeasuredStructure, slabs: Iterable[F32]) -> MeasuredStructure:
     """Add fractions and surface of all slices, named `_all`, with the half-widths of the measured slices.
 
     Args:
         slabs: all slices, some at a time. Each slab except the first begins with the last slice of the slab before,
             because surface may lie between them.
     """
-    count, surfaces, shares, pairs = found.materials.levels.size, list[float](), list[F64](), list[int]()
+    count, surfaces, shares, pairs = measured.materials.levels.size, list[float](), list[F64](), list[int]()
     for slab in slabs:
-        labels = labelled(slab, found.materials.thresholds)
-        surfaces.append(shares_of(labels, count, found.spacing, found.rules)["surface"])
+        labels = labelled(slab, measured.materials.thresholds)
+        surfaces.append(shares_of(labels, count, measured.spacing, measured.rules)["surface"])
         pairs.append(len(slab) - 1)
         own = labels[1:] if shares else labels
         shares.append(np.array([(own == k).mean(axis=(1, 2)) for k in range(count)]))
-    along, intervals = np.concatenate(shares, axis=1), dict(found.intervals)
+    along, intervals = np.concatenate(shares, axis=1), dict(measured.intervals)
     numbers = {
         **{f"fraction_{k}": float(share) for k, share in enumerate(along.mean(axis=1), 1)},
         "surface": float(np.average(surfaces, weights=pairs)),
     }
     for name, value in numbers.items():
-        of_all = replace(found.intervals[name], value=value)
+        of_all = replace(measured.intervals[name], value=value)
         # Without ends no number is determined, for a reason that holds for all slices.
         intervals[f"{name}_all"] = of_all if math.isnan(of_all.low) else _judged(name.split("_")[0], of_all)
-    return replace(found, intervals=intervals, along_all=along[found.rules.particles - 1])
+    return replace(measured, intervals=intervals, along_all=along[measured.rules.particles - 1])
 
 
-def difference(one: Interval, other: Interval) -> Interval:
+def difference(first: Interval, second: Interval) -> Interval:
     """The change between two states: the second minus the first. The squares of the half-widths are added, also for
     each cause.
     """
-    value, middle = other.value - one.value, (other.high + other.low - one.high - one.low) / 2
-    half = math.hypot((one.high - one.low) / 2, (other.high - other.low) / 2)
-    causes: dict[str, Any] = {cause: math.hypot(getattr(one, cause), getattr(other, cause)) for cause in CAUSES}
+    value, middle = second.value - first.value, (second.high + second.low - first.high - first.low) / 2
+    half = math.hypot((first.high - first.low) / 2, (second.high - second.low) / 2)
+    causes: dict[str, Any] = {cause: math.hypot(getattr(first, cause), getattr(second, cause)) for cause in CAUSES}
     alike = "the change is smaller than its uncertainty" if abs(middle) < half else ""
     return Interval(
-        value, middle - half, middle + half, other.moves - one.moves,
-        why_not=one.why_not or other.why_not or alike, **causes,
+        value, middle - half, middle + half, second.moves - first.moves,
+        why_not=first.why_not or second.why_not or alike, **causes,
     )  # fmt: skip

@@ -61,8 +61,8 @@ def central(mask: NDArray[Any], side: int, spacing: Spacing = (1, 1, 1)) -> NDAr
 
 def label_values(volume: F32) -> F64:
     """The different values of a segmented volume (labels), 2 to 6 of them. Empty if the volume contains grey values."""
-    for some in (volume[len(volume) // 2], volume):
-        values = np.unique(some)
+    for voxels in (volume[len(volume) // 2], volume):
+        values = np.unique(voxels)
         if values.size > MOST:
             return np.empty(0)
     return values.astype(np.float64) if values.size > 1 else np.empty(0)
@@ -116,13 +116,15 @@ def _valleys(volume: F32, levels: F64) -> F64:
     """Ratio of voxels half-way between neighbouring levels to voxels near the rarer of the two levels."""
     gaps = np.diff(levels)
     near = np.minimum(np.r_[gaps[0], gaps], np.r_[gaps, gaps[-1]]) / 8
-    at = [np.count_nonzero(np.abs(volume - level) < width) / width for level, width in zip(levels, near, strict=True)]
+    counts_per_width = [
+        np.count_nonzero(np.abs(volume - level) < width) / width for level, width in zip(levels, near, strict=True)
+    ]
     middles = (levels[1:] + levels[:-1]) / 2
     between = [
         np.count_nonzero(np.abs(volume - middle) < gap / 8) / (gap / 8)
         for middle, gap in zip(middles, gaps, strict=True)
     ]
-    return np.array(between) / np.maximum(np.minimum(at[1:], at[:-1]), 1e-9)
+    return np.array(between) / np.maximum(np.minimum(counts_per_width[1:], counts_per_width[:-1]), 1e-9)
 
 
 def labelled(volume: F32, thresholds: F64) -> Labels:

@@ -44,11 +44,11 @@ def seen_in(path: Path, read: volumes.ReadSlices, answer: Answer, **values: Any)
     if read.limit_sentence:
         answer.warn(f"{path}: {read.limit_sentence}")
     box = volumes.box_in(read.record.volume.data, values["crop"])
-    seen = measured(path, read, box, answer, **values)
+    measured_part = measured(path, read, box, answer, **values)
     if not read.limit_sentence:
-        return seen
-    slabs = volumes.slabs_of(path, values["dataset"], read, seen.box, answer.counting("reading slabs"))
-    return replace(seen, found=intervals.with_all_slices(seen.found, slabs))
+        return measured_part
+    slabs = volumes.slabs_of(path, values["dataset"], read, measured_part.box, answer.counting("reading slabs"))
+    return replace(measured_part, found=intervals.with_all_slices(measured_part.found, slabs))
 
 
 def measured(path: Path, read: volumes.ReadSlices, box: volumes.Box, answer: Answer, **values: Any) -> Seen:
@@ -94,7 +94,7 @@ def measured(path: Path, read: volumes.ReadSlices, box: volumes.Box, answer: Ans
     rules = Rules(particles, values["through"], values["radius"], values["smallest"], values["neck"], values["side"])
     dz, dy, dx = (1e3 * edge for edge in grid.spacing)
     try:
-        found = measured_structure(
+        structure = measured_structure(
             volume, parts, n_materials, (dz, dy, dx), rules, answer.counting("measuring the structure")
         )
     except ValueError as error:
@@ -105,7 +105,7 @@ def measured(path: Path, read: volumes.ReadSlices, box: volumes.Box, answer: Ans
             else "reconstruct from more projections"
         )
         raise ValueError(f"{error}; {way_out}{', or give fewer --materials' if n_materials > 2 else ''}") from error
-    return Seen(path, read, box, grid, volume, found)
+    return Seen(path, read, box, grid, volume, structure)
 
 
 def halves_in(path: Path, read: volumes.ReadSlices, answer: Answer, **values: Any) -> list[Any]:

@@ -18,12 +18,12 @@ _OF_VOLUMES = "parts", "slices", "voxel_um", "scan", "quick"  # options that --s
 def numbers_in_text(text: str) -> list[float]:
     """Parse numbers separated by commas. Raises ValueError for other text."""
     try:
-        found = [float(part) for part in text.split(",")]
+        numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        found = [math.nan]
-    if not all(map(math.isfinite, found)):
+        numbers = [math.nan]
+    if not all(map(math.isfinite, numbers)):
         raise ValueError(f"{text!r}: expected numbers such as 0.2,0.5,1, one for each state")
-    return found
+    return numbers
 
 
 def edges_of(text: str) -> Spacing:
@@ -46,8 +46,8 @@ def refuse_together(states: bool, compare: bool, n: int, values: dict[str, Any])
         raise click.UsageError(f"--compare needs two volumes, got {n}.")
     if values["parts"] and (n > 1 or values["scan"]):
         raise click.UsageError("--parts needs exactly one volume, and cannot be combined with --scan.")
-    given = {"--compare": compare, **{f"--{name.replace('_', '-')}": values[name] for name in _OF_VOLUMES}}
-    if states and (others := [name for name, value in given.items() if value]):
+    options = {"--compare": compare, **{f"--{name.replace('_', '-')}": values[name] for name in _OF_VOLUMES}}
+    if states and (others := [name for name, value in options.items() if value]):
         raise click.UsageError(f"--states cannot be combined with {others[0]}.")
     if values["charge"] and not states:
         raise click.UsageError("--charge needs --states.")

@@ -88,9 +88,9 @@ def cleaned(mask: Mask, radius: int = 1, smallest: int = 27, spacing: Spacing = 
         out = ndimage.binary_closing(ndimage.binary_opening(out, ball), ball)
         out = out[(slice(2 * radius, -2 * radius),) * 3]
     parts, n = ndimage.label(ndimage.binary_fill_holes(out))
-    kept = np.bincount(parts.ravel(), minlength=n + 1) * edges.prod() >= smallest
-    kept[0] = False
-    return np.asarray(kept[parts])
+    large_enough = np.bincount(parts.ravel(), minlength=n + 1) * edges.prod() >= smallest
+    large_enough[0] = False
+    return np.asarray(large_enough[parts])
 
 
 def parted(mask: Mask, neck: float, spacing: Spacing = (1, 1, 1)) -> Numbers:
@@ -173,13 +173,15 @@ def surfaces(labels: NDArray[np.integer], spacing: Spacing = (1, 1, 1), goes_on:
     weights = np.bincount(nearest, minlength=len(steps)) / turn.size
     total = np.zeros(int(labels.max()) + 1)
     for step, length, weight in zip(_DIRECTIONS, lengths, weights, strict=True):
-        one, other = (
+        first, second = (
             labels[
                 tuple(slice(max(sign * d, 0), n + min(sign * d, 0)) for d, n in zip(step, labels.shape, strict=True))
             ]
             for sign in (1, -1)
         )
-        differs = one != other
-        crossings = np.bincount(one[differs], minlength=total.size) + np.bincount(other[differs], minlength=total.size)
+        differs = first != second
+        crossings = np.bincount(first[differs], minlength=total.size) + np.bincount(
+            second[differs], minlength=total.size
+        )
         total += 2 * weight * math.prod(spacing) / length * crossings * (labels.size / differs.size if goes_on else 1)
     return total

@@ -16,23 +16,23 @@ from splatline_structure.materials import F32
 from splatline_structure.volumes import ReadSlices
 
 
-def pictures_of(found: MeasuredStructure, volume: F32, grid: Grid, read: ReadSlices) -> list[Picture]:
+def pictures_of(measured: MeasuredStructure, volume: F32, grid: Grid, read: ReadSlices) -> list[Picture]:
     """All pictures of a page; the picture of sizes only if a particle is whole."""
-    with_band = " (band: from each half of the projections)" if found.parts else ""
+    with_band = " (band: from each half of the projections)" if measured.parts else ""
     shown = [
         Picture(
             "Materials",
             "The middle slice, its labels (red: could be of either material), and its particles.",
-            slices(found, volume, grid),
+            slices(measured, volume, grid),
         )
     ]
-    if not found.structure.particles.cut.all():
+    if not measured.structure.particles.cut.all():
         shown.append(
             Picture(
                 "Sizes",
                 f"Fraction of the volume of whole particles below a diameter{with_band}. Lines: intervals of the "
                 "sizes.",
-                sizes(found),
+                sizes(measured),
             )
         )
     return [
@@ -40,29 +40,29 @@ def pictures_of(found: MeasuredStructure, volume: F32, grid: Grid, read: ReadSli
         Picture(
             "Profiles",
             f"Fraction of the particles' material{with_band}{'; grey: all slices' if read.limit_sentence else ''}.",
-            profiles(found, grid, read),
+            profiles(measured, grid, read),
         ),
         Picture(
             "What limits the intervals",
             "Half-width from each cause, for the numbers that are determined.",
-            causes(found.intervals),
+            causes(measured.intervals),
         ),
     ]
 
 
-def slices(found: MeasuredStructure, volume: F32, grid: Grid) -> bytes:
+def slices(measured: MeasuredStructure, volume: F32, grid: Grid) -> bytes:
     """The middle slice, next to its labels and its particles."""
     figure = new_figure((WIDTH, WIDTH / 3 * grid.shape[1] / grid.shape[2] + 0.9))
-    at, levels = grid.shape[0] // 2, found.materials.levels
+    middle_slice, levels = grid.shape[0] // 2, measured.materials.levels
     plane, window = planes(grid, "mm")[0], (float(levels[0]), float(levels[-1]))
-    left, middle, right = np.ravel(figure.subplots(1, 3, sharex=True, sharey=True))
-    shown = draw_slice(left, volume[at], plane, "volume", window, size=7)
-    labels = found.structure.labels[at].astype(np.float32)
+    volume_axes, middle, right = np.ravel(figure.subplots(1, 3, sharex=True, sharey=True))
+    shown = draw_slice(volume_axes, volume[middle_slice], plane, "volume", window, size=7)
+    labels = measured.structure.labels[middle_slice].astype(np.float32)
     draw_slice(middle, labels, plane, "materials", (0.0, max(float(len(levels) - 1), 1.0)), size=7)
     unsure = np.zeros((*labels.shape, 4))
-    unsure[found.unsure[at]] = (1, 0.1, 0.1, 0.9)
+    unsure[measured.unsure[middle_slice]] = (1, 0.1, 0.1, 0.9)
     middle.imshow(unsure, extent=shown.get_extent(), interpolation="nearest")
-    numbers = found.structure.numbered[at]
+    numbers = measured.structure.numbered[middle_slice]
     draw_slice(
         right, np.where(numbers > 0, numbers * 7 % 20 + 1, 0), plane, "particles", (0.0, 20.0), "nipy_spectral", 7
     )
@@ -71,31 +71,35 @@ def slices(found: MeasuredStructure, volume: F32, grid: Grid) -> bytes:
     return png(figure)
 
 
-def sizes(found: MeasuredStructure) -> bytes:
+def sizes(measured: MeasuredStructure) -> bytes:
     """Cumulative volume of whole particles over diameter, with the intervals of the quantiles."""
     figure = new_figure((WIDTH, 3.2))
     axes = figure.subplots()
-    whole = [each.particles.diameter[~each.particles.cut] for each in (found.structure, *found.parts)]
-    at = np.linspace(0, max(float(each.max()) for each in whole if each.size), 60)
-    _banded(axes, at, [np.array([(d[d <= x] ** 3).sum() for x in at]) / max(float((d**3).sum()), 1e-30) for d in whole])
-    shares = {percent / 100: found.intervals[f"size_{percent}"] for percent in (10, 50, 90)}
+    whole = [each.particles.diameter[~each.particles.cut] for each in (measured.structure, *measured.parts)]
+    diameters = np.linspace(0, max(float(each.max()) for each in whole if each.size), 60)
+    _banded(
+        axes,
+        diameters,
+        [np.array([(d[d <= x] ** 3).sum() for x in diameters]) / max(float((d**3).sum()), 1e-30) for d in whole],
+    )
+    shares = {percent / 100: measured.intervals[f"size_{percent}"] for percent in (10, 50, 90)}
     sure = {share: each for share, each in shares.items() if not each.why_not}
     axes.hlines([*sure], [each.low for each in sure.values()], [each.high for each in sure.values()], "C1")
     finish(axes, "equivalent diameter (µm)", "fraction of the volume", f"{whole[0].size} whole particles", grid=True)
     return png(figure)
 
 
-def profiles(found: MeasuredStructure, grid: Grid, read: ReadSlices) -> bytes:
+def profiles(measured: MeasuredStructure, grid: Grid, read: ReadSlices) -> bytes:
     """The fraction of the particles' material along z (in grey: all slices), and in rings around the middle."""
-    structures = [found.structure, *found.parts]
+    structures = [measured.structure, *measured.parts]
     figure = new_figure((WIDTH, 2.8))
-    left, right = np.ravel(figure.subplots(1, 2, sharey=True))
+    fraction_axes, right = np.ravel(figure.subplots(1, 2, sharey=True))
     z = grid.coordinates()[0]
-    if found.along_all is not None:
+    if measured.along_all is not None:
         all_z = z[0] + grid.spacing[0] * (np.arange(read.asked.start, read.asked.stop) - read.slices.start)
-        left.plot(all_z, found.along_all, color="0.6")
-    _banded(left, z, [each.along_z for each in structures])
-    finish(left, "z (mm)", "fraction", grid=True)
+        fraction_axes.plot(all_z, measured.along_all, color="0.6")
+    _banded(fraction_axes, z, [each.along_z for each in structures])
+    finish(fraction_axes, "z (mm)", "fraction", grid=True)
     _banded(right, structures[0].radial[1], [each.radial[0] for each in structures])
     finish(right, "distance from the middle (µm)", "", grid=True)
     return png(figure)
@@ -128,7 +132,9 @@ def curves_of(series: Mapping[str, Sequence[Interval]], x: Sequence[float], acro
     for axes, (name, each) in zip(
         np.ravel(figure.subplots(len(series), 1, sharex=True, squeeze=False)), series.items(), strict=True
     ):
-        low, high, value = (np.array([getattr(one, part) for one in each], float) for part in ("low", "high", "value"))
+        low, high, value = (
+            np.array([getattr(interval, part) for interval in each], float) for part in ("low", "high", "value")
+        )
         axes.fill_between(x, low, high, alpha=0.3)
         axes.plot(x, np.where(np.isfinite(value), value, np.nan), "o-")
         finish(axes, across, name, size=8, grid=True)

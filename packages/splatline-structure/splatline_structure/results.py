@@ -60,19 +60,19 @@ def particles_table(particles: Particles, grid: Grid) -> str:
     return csv_text(rows)
 
 
-def facts_of(found: MeasuredStructure, settings: Mapping[str, Any]) -> dict[str, Any]:
+def facts_of(measured: MeasuredStructure, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The structure without its arrays, for JSON; numbers that are not determined are null."""
-    particles = found.structure.particles
+    particles = measured.structure.particles
     return {
-        **settings, "levels": found.materials.levels.tolist(), "spread": found.materials.spread.tolist(),
-        "thresholds_off": found.off, "undecided": found.undecided, "parts": len(found.parts),
+        **settings, "levels": measured.materials.levels.tolist(), "spread": measured.materials.spread.tolist(),
+        "thresholds_off": measured.off, "undecided": measured.undecided, "parts": len(measured.parts),
         "particles": int(particles.label.size), "cut": int(particles.cut.sum()), "numbers": {
             name: {**asdict(each), "value": None if each.why_not else each.value, "unit": unit_of(name),
                    "decides": each.decides}
-            for name, each in found.intervals.items()
+            for name, each in measured.intervals.items()
         },
-        "along_z": found.structure.along_z.tolist(), "radial": found.structure.radial[0].tolist(),
-        "radii_um": found.structure.radial[1].tolist(),
+        "along_z": measured.structure.along_z.tolist(), "radial": measured.structure.radial[0].tolist(),
+        "radii_um": measured.structure.radial[1].tolist(),
     }  # fmt: skip
 
 

@@ -22,7 +22,7 @@ NAMES = {"grey": "change of the grey level (%)", "volume": "change of the volume
 
 def pictures_of(reference: ReferenceParticles, states: Sequence[MeasuredState], across: str) -> list[Picture]:
     """All pictures of a page."""
-    whole, at = ~reference.cut, np.array([state.at for state in states])
+    whole, positions = ~reference.cut, np.array([state.at for state in states])
     series = {
         "grey": 100 * np.stack([state.numbers.grey_change[whole] for state in states], axis=1),
         "volume": 100 * np.stack([state.numbers.growth[whole] for state in states], axis=1),
@@ -33,7 +33,7 @@ def pictures_of(reference: ReferenceParticles, states: Sequence[MeasuredState], 
             "Particles against the states",
             "Thin: single particles, with the interval of one of them. Thick: the median, with a band from 10 % to "
             "90 % of the particles. Below: how many particles are cracked, closed or gone.",
-            curves(series, verdicts, at, across),
+            curves(series, verdicts, positions, across),
         ),
         Picture(
             "Distribution over the particles", "Share of the particles below a value, for each state.",
@@ -46,26 +46,33 @@ def pictures_of(reference: ReferenceParticles, states: Sequence[MeasuredState], 
     ]  # fmt: skip
 
 
-def curves(series: dict[str, F64], verdicts: Any, at: F64, across: str) -> bytes:
+def curves(series: dict[str, F64], verdicts: Any, positions: F64, across: str) -> bytes:
     """Numbers [particle, state, 3] with the median and the spread, and the number of particles of each verdict."""
     figure = new_figure((WIDTH, 7.5))
     *panels, below = np.ravel(figure.subplots(3, 1, sharex=True))
     for axes, (name, each) in zip(panels, series.items(), strict=True):
         value = each[..., 0]
         shown = np.flatnonzero(np.isfinite(value).any(1))
-        some = shown[np.linspace(0, max(shown.size - 1, 0), min(_LINES, shown.size)).astype(int)]
-        axes.plot(at, value[some].T, ".-", color="0.7", linewidth=0.5, markersize=2)
+        drawn_lines = shown[np.linspace(0, max(shown.size - 1, 0), min(_LINES, shown.size)).astype(int)]
+        axes.plot(positions, value[drawn_lines].T, ".-", color="0.7", linewidth=0.5, markersize=2)
         if shown.size:
-            one = each[shown[shown.size // 2]]
-            axes.errorbar(at, one[:, 0], np.abs(one[:, 1:].T - one[:, 0]), color="C1", capsize=2, linewidth=1)
-        seen = np.isfinite(value).any(0)
-        if seen.any():
-            low, middle, high = np.nanpercentile(value[:, seen], (10, 50, 90), axis=0)
-            axes.fill_between(at[seen], low, high, alpha=0.3)
-            axes.plot(at[seen], middle, "o-")
+            typical_particle = each[shown[shown.size // 2]]
+            axes.errorbar(
+                positions,
+                typical_particle[:, 0],
+                np.abs(typical_particle[:, 1:].T - typical_particle[:, 0]),
+                color="C1",
+                capsize=2,
+                linewidth=1,
+            )
+        has_values = np.isfinite(value).any(0)
+        if has_values.any():
+            low, middle, high = np.nanpercentile(value[:, has_values], (10, 50, 90), axis=0)
+            axes.fill_between(positions[has_values], low, high, alpha=0.3)
+            axes.plot(positions[has_values], middle, "o-")
         finish(axes, "", NAMES[name], size=8, grid=True)
     for name in _COLOURS:
-        below.plot(at, (verdicts == name).sum(1), "o-", label=name)
+        below.plot(positions, (verdicts == name).sum(1), "o-", label=name)
     below.yaxis.get_major_locator().set_params(integer=True)
     finish(below, across, "particles", size=8, grid=True)
     return png(figure)
@@ -86,21 +93,21 @@ def distributions(series: dict[str, F64], names: Sequence[str]) -> bytes:
 def map_of(reference: ReferenceParticles, state: MeasuredState) -> bytes:
     """The middle slice of the reference with its particles coloured by growth, and by verdict."""
     grid, growth = reference.grid, 100 * state.numbers.growth[:, 0]
-    at = grid.shape[0] // 2
-    volume, owner = reference.volume[:, :, at] / grid.voxel_size, reference.owner[:, :, at]
+    middle_slice = grid.shape[0] // 2
+    volume, owner = reference.volume[:, :, middle_slice] / grid.voxel_size, reference.owner[:, :, middle_slice]
     inside = (
         volume
         > reference.around / grid.voxel_size + 0.5 * np.median([b.level for b in reference.bodies]) / grid.voxel_size
     )
     figure = new_figure((WIDTH, WIDTH / 2 * grid.shape[1] / grid.shape[2] + 0.6))
-    left, right = np.ravel(figure.subplots(1, 2, sharex=True, sharey=True))
+    volume_axes, right = np.ravel(figure.subplots(1, 2, sharex=True, sharey=True))
     plane = planes(grid, "mm")[0]
-    shown = draw_slice(left, volume, plane, "verdict", (0.0, float(np.percentile(volume, 99.5)) or 1.0), size=7)
+    shown = draw_slice(volume_axes, volume, plane, "verdict", (0.0, float(np.percentile(volume, 99.5)) or 1.0), size=7)
     colours = np.zeros((*volume.shape, 4))
     for name, colour in _COLOURS.items():
         numbers = 1 + np.flatnonzero(np.array(state.numbers.verdict) == name)
         colours[np.isin(owner, numbers) & inside] = colour
-    left.imshow(colours, extent=shown.get_extent(), interpolation="nearest")
+    volume_axes.imshow(colours, extent=shown.get_extent(), interpolation="nearest")
     of_owner = np.concatenate(([np.nan], growth))[owner]
     window = tuple(np.nanpercentile(growth, (2, 98))) if np.isfinite(growth).any() else (0.0, 1.0)
     drawn = draw_slice(right, np.where(inside, of_owner, np.nan), plane, NAMES["volume"], window, "viridis", 7)

@@ -110,8 +110,8 @@ def measure_states(paths: Sequence[Path], output: Path, answer: Answer, values: 
         progress(done, steps)
 
     states = []
-    across, at = _abscissa(charge, begun)
-    for path, x in zip(scans, at, strict=True):
+    across, positions = _abscissa(charge, begun)
+    for path, x in zip(scans, positions, strict=True):
         fit, n_views = _fitted(path, record, reference, answer.warn, tell)
         states.append(MeasuredState(path, x, n_views, numbers_of(reference, fit), fit.matches))
         if not fit.matches:

@@ -90,12 +90,12 @@ def study_structure(
         known = structure_of(  # of an empty volume, for the names of the numbers
             np.zeros((2, 2, 2), np.float32), np.arange(1.0, materials), (1, 1, 1), Rules(materials, 1)
         ).numbers
-        asked = {name: [each for each in known if f"{each}_".startswith(f"{name}_")] for name in names}
-        if unknown := [name for name, each in asked.items() if not each]:
+        known_of = {name: [each for each in known if f"{each}_".startswith(f"{name}_")] for name in names}
+        if unknown := [name for name, each in known_of.items() if not each]:
             raise click.UsageError(
                 f"--number {unknown[0]}: expected a kind, such as tortuosity, or one of {', '.join(known)}."
             )
-        names = tuple(dict.fromkeys(chain(*asked.values())))
+        names = tuple(dict.fromkeys(chain(*known_of.values())))
         tell, series, axis_col, box = answer.counting("reconstructing with fewer projections"), {}, None, None
         for done, n in enumerate(sorted(views, reverse=True)):  # axis and box are those of the most projections
             tell(done, len(views))

@@ -53,9 +53,11 @@ def tortuosity(mask: Mask, axis: int, spacing: Spacing = (1, 1, 1)) -> float:
         ones.append(line[1:][both])
         others.append(line[:-1][both])
         conducts.append(np.full(others[-1].size, conductance))
-    one, other = np.concatenate(ones), np.concatenate(others)
+    from_voxel, to_voxel = np.concatenate(ones), np.concatenate(others)
     first, last = number[0][number[0] >= 0], number[-1][number[-1] >= 0]
-    links = csr_array((np.tile(np.concatenate(conducts), 2), (np.r_[one, other], np.r_[other, one])), (n, n))
+    links = csr_array(
+        (np.tile(np.concatenate(conducts), 2), (np.r_[from_voxel, to_voxel], np.r_[to_voxel, from_voxel])), (n, n)
+    )
     diagonal = links.sum(axis=1) + 2.0 * np.bincount(np.r_[first, last], minlength=n)  # a face is half a voxel away
     source = np.zeros(n)
     source[first] = 2

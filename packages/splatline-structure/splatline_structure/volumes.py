@@ -168,14 +168,14 @@ def slabs_of(
     Raises:
         DataError: some values are not finite.
     """
-    asked = np.arange(read.asked.start, read.asked.stop)
+    requested = np.arange(read.asked.start, read.asked.stop)
     slabs = [
-        slice(max(at[0] - 1, asked[0]), at[-1] + 1)
-        for at in np.array_split(asked, math.ceil(asked.size / read.record.grid.shape[0]))
+        slice(max(block[0] - 1, requested[0]), block[-1] + 1)
+        for block in np.array_split(requested, math.ceil(requested.size / read.record.grid.shape[0]))
     ]
     with opened_volume(path, dataset) as record:
-        for taken, at in enumerate(slabs, 1):
-            slab = np.asarray(record.volume.data[at], np.float32)[:, *box[1:]]
+        for taken, slab_slices in enumerate(slabs, 1):
+            slab = np.asarray(record.volume.data[slab_slices], np.float32)[:, *box[1:]]
             if not np.isfinite(slab).all():
                 raise DataError(f"{path} has values that are not finite. Nothing was written.")
             yield slab
@@ -270,7 +270,7 @@ def parts_of(
             projections,
             the slices are not those of the scan's rows, or the volume does not state its axis.
     """
-    record, facts, at = read.record, read.record.parameters, read.slices
+    record, facts, slices = read.record, read.record.parameters, read.slices
     if math.isnan(record.axis_col):
         raise ValueError(
             "give --parts or --quick, because the volume does not state the rotation axis, which is needed to "
@@ -292,9 +292,9 @@ def parts_of(
                     "of its "
                     f"scan give {(end - first) // side}"
                 )
-            low, high = max(at.start - _BESIDE, 0), min(at.stop + _BESIDE, read.n_slices)
+            low, high = max(slices.start - _BESIDE, 0), min(slices.stop + _BESIDE, read.n_slices)
             picked = picked.selecting(replace(selection, rows=(first + low * side, first + high * side)))
-            at = slice(at.start - low, at.stop - low)
+            slices = slice(slices.start - low, slices.stop - low)
         elif read.limit_sentence:
             raise ValueError(
                 "give --quick or --parts, because halves of cone-beam projections must be reconstructed whole, and do "
@@ -310,7 +310,7 @@ def parts_of(
     for n in range(count):
         tell(n, count)
         chosen = np.sort(order[n::count])
-        made = recon.reconstruct(views.select(chosen), method=record.method)
-        volumes.append(made.volume.data[at] * np.float32(scale))
+        result = recon.reconstruct(views.select(chosen), method=record.method)
+        volumes.append(result.volume.data[slices] * np.float32(scale))
     tell(count, count)
     return volumes
