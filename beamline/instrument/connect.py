@@ -171,7 +171,7 @@ class ConnectedDevices:
 
     @property
     def truth(self) -> Callable[[Grid], Volume] | None:
-        """The ground truth of the scene, see `Simulated.truth`; None for a real instrument."""
+        """The ground truth of the scene, see `SimulatedScene.truth`; None for a real instrument."""
         return None if self.simulated is None else self.simulated.truth
 
     def __enter__(self) -> Self:

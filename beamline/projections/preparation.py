@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Preparation:
-    """How frames are converted to line integrals. `checked_views` and `OpenBeam` follow these settings.
+    """How frames are converted to line integrals. `checked_views` and the correction follow these settings.
 
     Attributes:
         flags: "use": projections with an alarm are left out, those with a warning get less weight. "judge": the monitor
@@ -119,7 +119,7 @@ class Preparation:
 
     @property
     def done(self) -> StepDone:
-        """What the file of the volume records about the preparation, apart from the record of `OpenBeam`."""
+        """What the file of the volume records about the preparation, apart from `ScanCorrectionPlan.beam_done`."""
         return StepDone(parameters={"flags": self.flags, "references": self.references})
 
     @property

@@ -21,7 +21,7 @@ class NamedStep(Protocol):
     can do.
 
     Attributes:
-        name: name of the step in events, and its key in `PreparedProjections.done`.
+        name: name of the step in events, and its key in `ScanOrigin.done`.
         follows: names of steps that come before it.
     """
 
