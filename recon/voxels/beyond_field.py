@@ -142,7 +142,8 @@ def _radius_of(views: Views) -> SampleRadius | None:
     one was right, this step changes densities by 2 %.
 
     A volume of a sample without texture predicts about as well in a box of any radius. So if a homogeneous cylinder
-    predicts the held-out projections as well as the best volume, the result is the radius of the cylinder.
+    predicts the held-out projections as well as the best volume, the result is the radius of the cylinder, unless it
+    is more than `_WIDEST` times the half width of the detector.
 
     Args:
         views: only some rows of some projections are read; rays of weight 0 do not count.
@@ -211,7 +212,8 @@ def _predicting_radius(views: Views, reach: float) -> SampleRadius | None:
     if predicts_as_well(tried[1.0][0], tried[least][0]):
         return None
     cylinder = _cylinder(trial)
-    if cylinder is not None and cylinder[0] > reach and predicts_as_well(cylinder[1], tried[least][0]):
+    fits = cylinder is not None and reach < cylinder[0] <= _WIDEST * reach
+    if cylinder is not None and fits and predicts_as_well(cylinder[1], tried[least][0]):
         radius = cylinder[0] / reach
         alike = [radius / _FINE, radius, radius * _FINE]
         tried |= {ratio: trial.of_radius(ratio * reach) for ratio in alike}

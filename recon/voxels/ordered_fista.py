@@ -49,8 +49,8 @@ _LEAST_ON_SUBSETS, _VIEWS_ON_SUBSETS = 6, 540
 _MOST_MOMENTUM = 0.9
 """Largest momentum of damped steps.
 
-A larger one accumulates the errors of the proximal steps, which have only three dual steps. If the air then weighs five
-times as much as the sample, the volume never converges: it changes by 1 % in four sweeps.
+A larger one accumulates the errors of the proximal steps. With three dual steps in each, and air that weighs five times
+as much as the sample, the volume then never converges: it changes by 1 % in four sweeps.
 """
 _LEAST_PACE = 0.5
 """Steps are damped only if the damped step of the coarsest shapes is at least this share of their step without damping.

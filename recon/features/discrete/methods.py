@@ -154,7 +154,7 @@ class Discrete(HalfVoxels):
         if not problem.go_on.going:
             return x
         if materials is None:
-            return self.in_half_voxels(problem, x, mu, TV_STEPS)
+            return self.in_half_voxels(problem, x, mu, FistaTv.tv_steps)
         before = 0 if problem.decide.ended is None else problem.decide.ended.after
         x = self.pulled(problem, x, weight, materials, self.first_sweeps)
         if (ended := problem.decide.ended) is not None:
@@ -162,7 +162,9 @@ class Discrete(HalfVoxels):
         if not problem.go_on.going:
             return x
         pull = partial(pull_to, materials)
-        return self.in_half_voxels(problem, x, mu * materials.tv_share, TV_STEPS, pull, self.first_sweeps - before)
+        return self.in_half_voxels(
+            problem, x, mu * materials.tv_share, FistaTv.tv_steps, pull, self.first_sweeps - before
+        )
 
     def materials(
         self, problem: VoxelProblem, weight: TvWeight, trial: Callable[[], Trial | None]
@@ -194,7 +196,7 @@ class Discrete(HalfVoxels):
         subsets = Subsets.of(problem, count, to_the_end)
         x = ordered_fista(
             further, x, TvWeight(weight.value * materials.tv_share), subsets, sweeps=self.iterations,
-            prox=tv_prox(problem, TV_STEPS), pull=pull, still=self.still,
+            prox=tv_prox(problem, FistaTv.tv_steps if to_the_end else TV_STEPS), pull=pull, still=self.still,
         )  # fmt: skip
         share = problem.decide(UNDECIDED, lambda: undecided_share(x[pull.where], materials))
         of_scan = materials.scaled(problem.units.density)._asdict()
