@@ -8,6 +8,7 @@ three tests: it must predict them better than the same total variation without a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -97,18 +98,27 @@ def _at_rows(reference: Volume, trial: Trial) -> Volume:
     return Volume(reference.data, replace(reference.grid, centre=(z - trial.above * pitch, y, x)))
 
 
-def _in_rows(reference: Volume, problem: VoxelProblem) -> Moved | None:
-    """The reference on the voxels of a problem; None: it shows no material there, or ends above or below.
+def if_it_overlaps(reference: Volume, problem: VoxelProblem) -> Moved | None:
+    """The reference on the voxels of a problem; None: it shows no material there, or it is above, below or beside
+    them.
+    """
+    with suppress(ValueError):
+        return not_moved(reference, problem)
+    return None
+
+
+def _in_rows(reference: Volume, problem: VoxelProblem) -> Moved | str:
+    """The reference on the voxels of a problem, or why it cannot be used there.
 
     Raises:
         ValueError: the reference is beside the volume.
     """
     try:
-        return not_moved(reference, problem)
+        return not_moved(reference, problem) or "the reference shows no material in the rows of the test"
     except ValueError:
         _, y, x = reference.grid.centre
         not_moved(Volume(reference.data, replace(reference.grid, centre=(0.0, y, x))), problem)
-        return None
+        return "the reference ends above or below the rows of the test"
 
 
 def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerdict:
@@ -122,9 +132,10 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
         return ReferenceVerdict(False, "a reference is used only with a parallel beam, and this is a cone")
     reference = _at_rows(reference, trial)
     moved = _in_rows(reference, problem)
-    if mu is None or moved is None:
-        because = "the reference shows no material in the rows of the test" if mu else "the weights could not be chosen"
-        return ReferenceVerdict(False, because)
+    if mu is None:
+        return ReferenceVerdict(False, "the weights could not be chosen")
+    if isinstance(moved, str):
+        return ReferenceVerdict(False, moved)
     mu /= np.sqrt(ONE_IN / (ONE_IN - 1))  # weight for the projections that are not held out, see `choose_weight`
     smooth = trial.volume_of_weight(mu) if trial.smooth is None else trial.smooth
     width, grid = width_of(trial.scan), problem.projector.grid

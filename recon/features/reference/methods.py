@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
@@ -16,7 +15,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import Method, Preview, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
-from recon.features.reference.choice import MARGIN, ReferenceVerdict, about_reference, asked, not_moved, width_of
+from recon.features.reference.choice import MARGIN, ReferenceVerdict, about_reference, asked, if_it_overlaps, width_of
 from recon.features.reference.fit import PLAN, StateFit
 from recon.features.reference.motion import KNOTS, Basis, padded
 from recon.features.reference.particles import bytes_placed, require_finite
@@ -175,9 +174,7 @@ class _State:
         self.moved = self.displacement = np.empty(0, np.float32)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        moved = None
-        with suppress(ValueError):  # a part of a volume that goes on above or below the reference
-            moved = not_moved(self._reference, problem)
+        moved = if_it_overlaps(self._reference, problem)
         if moved is None:
             return x
         grid, width, verdict = problem.projector.grid, width_of(problem), self._verdict

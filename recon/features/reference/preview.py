@@ -13,7 +13,7 @@ from recon.base.arrays import F32
 from recon.base.method import Preview
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
-from recon.features.reference.choice import not_moved, width_of
+from recon.features.reference.choice import if_it_overlaps, width_of
 from recon.features.reference.fit import PLAN, StateFit
 from recon.features.reference.motion import Basis, MotionViews, affinely_moved, padded, roughly_moved
 from recon.voxels.held_out import LEAST_VIEWS
@@ -25,7 +25,7 @@ from recon.voxels.voxel_problem import VoxelProblem, times_power
 def preview_of(reference: Volume, views: Views) -> Preview | None:
     """The moved reference plus FBP of the residual, on the voxels of a few detector rows. None in three cases: there
     are fewer than 16 projections, the geometry is not a parallel beam with straight rows, or the reference shows no
-    material there.
+    material there or does not overlap them.
 
     The motion is found as in `FromReference`, but with FBP of the residual instead of iterations. (With the motion
     known, this is one FBP: Chen, Tang & Leng 2008, Med. Phys. 35, 660, without the iterations.)
@@ -49,7 +49,7 @@ class _Leaves:
         self.left = math.nan
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        moved = not_moved(self._reference, problem)
+        moved = if_it_overlaps(self._reference, problem)
         if moved is None:
             return x
         grid, width = problem.projector.grid, width_of(problem)

@@ -79,16 +79,22 @@ def test_the_reference_of_another_sample_is_refused_to_the_bit(
     assert made.method == without.method
 
 
-@pytest.mark.parametrize("kind", ["none", "empty", "above"])
+@pytest.mark.parametrize(
+    ("kind", "because"),
+    [
+        ("none", "none was given"),
+        ("empty", "the reference shows no material in the rows of the test"),
+        ("above", "the reference ends above or below the rows of the test"),
+    ],
+)
 def test_without_a_usable_reference_the_volume_is_that_of_auto(
-    kind: str, state: tuple[F32, recon.Geometry], without: recon.Reconstruction, before: Volume
+    kind: str, because: str, state: tuple[F32, recon.Geometry], without: recon.Reconstruction, before: Volume
 ) -> None:
     above = replace(before.grid, centre=(1e3 * ROWS, 0.0, 0.0))
     empty, elsewhere = Volume(np.zeros_like(before.data), before.grid), Volume(before.data, above)
     given = {"none": None, "empty": empty, "above": elsewhere}[kind]
     made = recon.reconstruct(*state, recon.FromReference(given, AUTO))
     np.testing.assert_array_equal(made.volume.data, without.volume.data)
-    because = "none was given" if given is None else "the reference shows no material in the rows of the test"
     assert made.settings["reference_because"] == because
 
 

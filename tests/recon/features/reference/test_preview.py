@@ -73,6 +73,8 @@ def test_there_is_no_picture_without_enough_projections_or_a_reference(before: V
     assert recon.FistaTv().preview(Views(data, geometry)) is None
     empty = Volume(np.zeros_like(before.data), before.grid)
     assert FromReference(empty).preview(Views(*scanned(AFTER, VIEWS, 1e4))) is None
+    above = Volume(before.data, replace(before.grid, centre=(1e4, 0.0, 0.0)))
+    assert FromReference(above).preview(Views(*scanned(AFTER, VIEWS, 1e4))) is None
     cone = recon.Geometry.cone(np.arange(20.0), (4, N), pixel_pitch=1.0, sod=500.0, sdd=700.0)
     assert FromReference(before).preview(Views(np.ones((20, 4, N), np.float32), cone)) is None
 
