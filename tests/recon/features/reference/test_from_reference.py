@@ -126,10 +126,13 @@ def test_the_stated_memory_is_at_least_the_peak_of_a_slab(
     data, geometry = state
     shape = rows, N
     slab = replace(geometry, detector_shape=shape, axis_row=(rows - 1) / 2)
-    tall = np.tile(before.data, (rows // ROWS + 2 * beyond // ROWS, 1, 1))
+    # rows differ, so that a copy of the reference displaced along z predicts worse
+    density = np.random.default_rng(0).uniform(0.8, 1.2, rows + 2 * beyond).astype(np.float32)
+    tall = np.tile(before.data, (len(density) // ROWS, 1, 1)) * density[:, None, None]
+    lines = np.tile(data, (1, rows // ROWS, 1)) * density[beyond : beyond + rows, None]
     method = recon.FromReference(Volume(tall, Grid(tall.shape, before.grid.voxel_size)), AUTO)
     weights = np.ones((len(data), *shape), np.float32) if weighted else None
-    problem = ReconProblem(Views(np.tile(data, (1, rows // ROWS, 1)), slab, weights), Grid.matching(slab))
+    problem = ReconProblem(Views(lines, slab, weights), Grid.matching(slab))
     method.run(problem, RunControl())  # loads kernels
     stated = method.memory(slab, problem.grid, weighted) - tall.nbytes  # the reference is there before
     first = Decisions()
