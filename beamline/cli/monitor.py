@@ -65,7 +65,7 @@ def monitor(request: MonitorRequest) -> None:
     flagged frames, the worst score with its limit, the place in the frame and what to do. It also prints which checks
     could not be applied to which projections.
 
-    Exit code: 0 no alarm, 4 stopped, 7 alarms, or darks or flats with a fault.
+    Exit code: 0 no alarm, 4 stopped, 7 frames with an alarm, or a fault of the darks or flats.
     """
     from beamline.config.load import load
     from beamline.config.monitor import configured_checks, reference_limits

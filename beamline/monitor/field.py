@@ -49,17 +49,19 @@ class FieldState:
 
 @dataclass(frozen=True)
 class FieldOfViewCheck(Logged):
-    """Score: fraction of the frame without beam (flat), or line integral at the edge of the field of view (info, once a
-    scan).
+    """Score in a flat: fraction of the frame without beam. Score in a projection: line integral at the edge of the
+    field of view (a flag of the level info, at most one in a scan).
 
-    Reasons for the defaults: a line integral of 0.1 at the edges is a tenth of the value in the middle of a sample, and
-    more than phase fringes and scattered radiation cause there. Slits usually shadow one or two lines at the edges of
-    the frame.
+    Reasons for the defaults: a line integral of 0.1 at the edges is a tenth of the value in the middle of a sample.
+    Phase fringes and scattered radiation cause less there. Slits usually shadow one or two lines at the edges of the
+    frame.
     """
 
     name: ClassVar[str] = "field"
     bit: ClassVar[int] = 13
-    unit: ClassVar[str] = "fraction of the frame, or line integral at its edge"
+    unit: ClassVar[str] = (
+        "fraction of the frame (flats), or line integral at the edge of the field of view (projections)"
+    )
     meaning: ClassVar[str] = "a part of the frame gets no beam even without a sample"
 
     unlit: float = setting(0.02, "fraction of the frame that may be without beam", ge=0, lt=1)

@@ -61,14 +61,16 @@ class RunValues:
     free: float = published("DiskFree", "of the disk with the scan file", math.nan, "GB")
     age: float = published("FrameAge", "time since the last frame arrived in the file", math.nan, "s")
     data_rate: float = published("DataRate", "data per second", math.nan, "MB/s")
-    residual: float = published("ReconResidual", "projections that the live volume has not used yet", math.nan)
+    residual: float = published(
+        "ReconResidual", "relative residual of new projections before the live fit has used them", math.nan
+    )
     skipped: int = published("SkippedLines", "messages in the log that are not events", 0)
     angle: float = published("Angle", "of the newest frame in the file", math.nan, "deg")
     flag_names: tuple[str, ...] = published("FlagNames", "checks of the monitor that flagged frames", ())
     flag_counts: tuple[int, ...] = published("FlagCounts", "flags of each check in FlagNames", ())
     pass_number: int = published("PassNumber", "number of the last finished pass of projections, from 1", 0)
     options: tuple[str, ...] = published(
-        "Options", "what the scan can measure after this pass: next, again, wide ...", ()
+        "Options", "choices of what to measure after this pass: next, again, offset, retake, enough", ()
     )
     option_gains: tuple[float, ...] = published("OptionGains", "predicted improvement by each of Options", (), "dB")
     option_lows: tuple[float, ...] = published("OptionGainsLow", "lower ends of OptionGains", (), "dB")

@@ -269,8 +269,10 @@ def _only(path: Path, axes: dict[str, int]) -> str:
                 f"{path} is a scan ({scan}), not a volume. `beamline recon {path}` makes a volume of it, "
                 f"and `beamline view {path}` shows its frames."
             )
+        if not volumes:
+            raise DataError(f"{path} contains no array with three axes, so it is not a volume.")
         raise DataError(
-            f"{path} contains {len(volumes)} volumes ({', '.join(volumes) or 'none'}). Name one as its "
-            "dataset; in `view` as FILE::NAME."
+            f"{path} contains {len(volumes)} volumes ({', '.join(volumes)}). Choose one with --dataset NAME, "
+            "or with FILE::NAME in `beamline view`. Commands without this option need a file with a single volume."
         )
     return volumes[0]

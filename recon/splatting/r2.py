@@ -92,8 +92,12 @@ class R2(Fit):
         return PnpDct().trial_sweeps + round(FIRST_SHARE * (self.planned_steps or 0)) + refined
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The residuals of the fit in the held-out projections. The test includes the voxel refinement if a number of
-        steps ends the fit, but not if a time limit ends it."""
+        """The residuals of the method's volume in the held-out projections.
+
+        Usually the test makes a quarter of the steps, and all steps only if the result is then undecided, see
+        `trial_fit.predict`. The method runs unchanged, with its own end and voxel refinement, in these cases: `finish`,
+        `seconds` or `early_stop` is set; the fit starts from given Gaussians; the trial has no prior.
+        """
         by_other_settings = self.finish is not None or self.seconds is not None or isinstance(self.gaussians, Gaussians)
         if by_other_settings or self.early_stop or trial.prior is None:
             return trial.predicted(self)

@@ -199,8 +199,9 @@ class StreamingFit:
         """Make the final fit to all projections after the scan. The final fit has `last_steps` steps; a time limit of
         about `seconds` s may end it earlier.
 
-        The rates decay until the end of the final fit. Density control continues in the first half. `on_progress` is
-        called about ten times a second; if it returns True, the fit ends.
+        The learning rates decay until the end of the final fit. Density control continues until half of the final fit
+        is done, measured by its steps or by its time limit. `on_progress` is called about ten times a second; if it
+        returns True, the fit ends.
 
         Raises:
             ValueError: no projection has arrived, or the projections show no material.

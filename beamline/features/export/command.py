@@ -256,7 +256,7 @@ def _export_poses(volume: Path, output: Path, as_json: bool) -> None:
         lines = (
             f"output  {output} (CSV)",
             f"views   {views}",
-            f"axis    use --axis {axis_col:.2f} together with these --poses",
+            f"axis    column {axis_col:.2f}: reconstruct with --poses {output} --axis {axis_col:.2f}",
         )
         answer.done({"output": output, "views": views, "axis_col": axis_col}, *lines)
 

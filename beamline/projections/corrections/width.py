@@ -136,10 +136,14 @@ class Width:
             if self.arc != "auto":
                 motion = stated
                 if bent and stated.skew:
-                    beam = "a cone" if geometry.is_cone else "rolled or tilted, or to be calibrated for roll or tilt"
+                    found = (
+                        "the beam is a cone"
+                        if geometry.is_cone
+                        else "the projections are rolled or tilted, or will be calibrated for roll or tilt"
+                    )
                     raise ConfigError(
-                        f"--exposure-arc {self.arc}: a readout arc is supported only for an untilted parallel "
-                        f"beam, and this is {beam}. Give the exposure arc alone. Nothing was written."
+                        f"Use --exposure-arc {self.arc.split(':')[0]} instead of {self.arc}: the readout arc (after "
+                        f"the colon) needs a parallel beam without roll or tilt, but {found}. Nothing was written."
                     )
             elif abs(stated.arc) * reach >= _LEAST_PX:
                 motion = _Motion(stated.arc, 0.0 if bent else stated.skew)

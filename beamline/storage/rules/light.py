@@ -274,9 +274,9 @@ def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
         doubt = f"scaled to {usual:g} s" + (
             "."
             if known
-            else f". The exposure of the flats is not stated: {np.nan_to_num(taken, nan=usual).max():g} s is "
-            "assumed, so that no projection is brighter than the flats. If the sample fills the field of "
-            "view, all line integrals may be wrong by the same amount."
+            else f". The exposure of the flats is not stated. {np.nan_to_num(taken, nan=usual).max():g} s is "
+            "assumed, because no projection is then brighter than the flats. If the sample fills the field of view, "
+            "this may be a wrong exposure. All line integrals are then wrong by the same amount."
         )
         yield Finding(
             "info" if known else "warning",

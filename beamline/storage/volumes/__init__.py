@@ -46,8 +46,8 @@ def entries() -> Registry[FormatEntry]:
         suffixes = tuple(kind().suffixes)
         if not suffixes or taken & set(suffixes) or any(suffix[:1] != "." for suffix in suffixes):
             raise ValueError(
-                f"the suffixes of the format are {suffixes}; expected suffixes such as '.xyz' that are not in use: "
-                f"{sorted(taken)}"
+                f"the suffixes of the format are {suffixes}; expected one or more suffixes, each with a dot at its "
+                f"start ('.xyz'). Other formats already use {', '.join(sorted(taken))}"
             )
         if getattr(import_module(kind.__module__), kind.__name__, None) is not kind:
             raise ValueError(

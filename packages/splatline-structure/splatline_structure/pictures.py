@@ -18,11 +18,11 @@ from splatline_structure.volumes import ReadSlices
 
 def pictures_of(measured: MeasuredStructure, volume: F32, grid: Grid, read: ReadSlices) -> list[Picture]:
     """All pictures of a page; the picture of sizes only if a particle is whole."""
-    with_band = " (band: from each half of the projections)" if measured.parts else ""
+    band = " The band spans the curves from all projections and from each half." if measured.parts else ""
     shown = [
         Picture(
             "Materials",
-            "The middle slice, its labels (red: could be of either material), and its particles.",
+            "The middle slice: the volume, the materials (red: voxels of uncertain material), and the particles.",
             slices(measured, volume, grid),
         )
     ]
@@ -30,8 +30,9 @@ def pictures_of(measured: MeasuredStructure, volume: F32, grid: Grid, read: Read
         shown.append(
             Picture(
                 "Sizes",
-                f"Fraction of the volume of whole particles below a diameter{with_band}. Lines: intervals of the "
-                "sizes.",
+                "Of the total volume of the particles: the fraction in particles up to each diameter. Particles that "
+                "the edge of the box cuts are left out. Horizontal lines: the intervals of the diameters at 10, 50 and "
+                f"90 % of the volume.{band}",
                 sizes(measured),
             )
         )
@@ -39,12 +40,13 @@ def pictures_of(measured: MeasuredStructure, volume: F32, grid: Grid, read: Read
         *shown,
         Picture(
             "Profiles",
-            f"Fraction of the particles' material{with_band}{'; grey: all slices' if read.limit_sentence else ''}.",
+            "Fraction of the particles' material in each slice, and at each distance from the middle."
+            f"{' Grey: all slices.' if read.limit_sentence else ''}{band}",
             profiles(measured, grid, read),
         ),
         Picture(
             "What limits the intervals",
-            "Half-width from each cause, for the numbers that are determined.",
+            "Half-width of the intervals from each cause. Numbers that could not be determined are left out.",
             causes(measured.intervals),
         ),
     ]

@@ -205,10 +205,10 @@ def fit_share(
 
     Args:
         found: result of `fit_materials` from the same projections.
-        states: indices of the two materials.
-        go_on: function called before each of at most `STEPS` steps, with the number of steps that may still follow. If
-            `go_on` returns False, the fit ends with the densities reached so far. stop: function called many times
-            within a step. If `stop` returns True, the fit ends at once, with the densities reached so far.
+        states: indices in `found.densities` of the two states.
+        go_on: function called before each step. There are at most `STEPS` steps. Its argument is the largest number of
+            steps after this one. If `go_on` returns False, the function returns `found`, unchanged.
+        stop: function called many times within a step. If `stop` returns True, the function returns `found`, unchanged.
 
     Raises:
         ValueError: `states` are not two different materials.

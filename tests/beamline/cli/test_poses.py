@@ -48,7 +48,7 @@ def test_poses_of_a_volume_come_back_as_a_table_that_gives_the_same_volume(tmp_p
     np.testing.assert_allclose(read(tmp_path / "a.h5", "view_tilt_deg"), TURNS[:, 1])
     assert "Poses of the projections" in (tmp_path / "a.html").read_text()
     code, said = run("export", tmp_path / "a.h5", "-o", tmp_path / "a.csv", "--poses")
-    axis = f"use --axis {read(tmp_path / 'a.h5', 'axis_col'):.2f} together with these --poses"
+    axis = f"--poses {tmp_path / 'a.csv'} --axis {read(tmp_path / 'a.h5', 'axis_col'):.2f}"
     assert code == 0 and "40" in said and axis in said, said
     rows = list(csv.DictReader((tmp_path / "a.csv").read_text().splitlines()))
     assert len(rows) == N

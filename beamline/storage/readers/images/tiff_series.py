@@ -271,7 +271,10 @@ def _omitted(images: NamedImages) -> tuple[tuple[int, ...], str]:
 
 _META = "meta_data.json"
 _TEST = "projections that the authors of the scene keep as test data; they are left out"
-_AXES = "volume[z, y, x] is vol_gt.transpose(2, 0, 1)[::-1, ::-1]; lengths in mm are units of the scene"
+_AXES = (
+    "volume[z, y, x] shows the same as vol_gt.transpose(2, 0, 1)[::-1, ::-1]; one unit of length of the scene counts "
+    "as 1 mm"
+)
 
 
 def _scene_of(path: Path) -> Path | None:
