@@ -64,7 +64,7 @@ class FieldOfViewCheck(Logged):
     )
     meaning: ClassVar[str] = "a part of the frame gets no beam even without a sample"
 
-    unlit: float = setting(0.02, "fraction of the frame that may be without beam", ge=0, lt=1)
+    unlit: float = setting(0.02, "fraction of a flat without beam above which there is a warning", ge=0, lt=1)
     edge: float = setting(LEAST, "line integral at the edges up to which the sample counts as inside", ge=0)
 
     start = FieldState
@@ -250,7 +250,7 @@ class PixelsCheck(Logged):
     unit: ClassVar[str] = "fraction of the pixels"
     meaning: ClassVar[str] = "many pixels of the camera are dead, or have no value"
 
-    warn: float = setting(1e-3, "fraction of the pixels that may be dead", ge=0, le=1)
+    warn: float = setting(1e-3, "fraction of dead pixels above which there is a warning", ge=0, le=1)
 
     start = PixelsState
 

@@ -252,8 +252,11 @@ def _steady(
     )
     outlier, odd = _out_of_line(levels, angles)
     if odd > max(_STEP_OF_LIGHT, np.nan_to_num(size)):
-        size, more = odd, f"{odd:.2f} in line integral more than these differ from each other"
-        what = f"The intensity of the whole frame {frames[outlier]} differs from its neighbours in angle, by {more}"
+        size = odd
+        what = (
+            f"The whole frame {frames[outlier]} is brighter or darker than its neighbours in angle: the median of its "
+            f"line integrals differs from theirs by {odd:.2f} more than the medians of other neighbours suggest"
+        )
     sentence = (
         f"{what}, and there is no air next to the sample to correct this. Intensity, exposure, energy or "
         "filter changed, or some projections belong to another scan. Use --views to choose "

@@ -20,8 +20,7 @@ class Projections:
     Attributes:
         data: float32 [view, row, col], dimensionless, finite.
         view_ids: int64 [view].
-        floored: fraction of the values of live pixels whose transmission was below the lowest allowed value, and was
-            set to this value.
+        floored: fraction of the values of live pixels that were raised to the lowest allowed transmission.
         air: float32 [view], mean transmission of the air columns in each projection. The projection was divided by this
             transmission; it is 1 if there are no air columns.
         masked: bool [row, col], dead and hot pixels, filled from their neighbours in every projection.

@@ -255,7 +255,7 @@ class PnpDct(VoxelMethod):
 
     @property
     def trial_steps(self) -> int:
-        """Steps with patches in a test reconstruction: as many as for the volume, but at most the usual number."""
+        """Number of PnP-DCT steps in a test reconstruction: `iterations`, but at most the default of `iterations`."""
         return min(self.iterations, PnpDct.iterations)
 
     @classmethod

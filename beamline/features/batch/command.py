@@ -85,8 +85,8 @@ def run_batch(scans: Sequence[Path], recipe: Path | None, folder: Path, sink: Si
         lock = WriterLock(folder / RECIPE, exclusive=True)
     except (BlockingIOError, PermissionError) as error:
         raise DataError(
-            f"Wait until the other batch in {folder} has ended, or name another folder: its {RECIPE} is locked or "
-            f"cannot be written ({error.strerror})."
+            f"{folder / RECIPE} cannot be locked ({error.strerror}): another batch is running in this folder, or the "
+            "file is write-protected. Wait until the other batch has ended, or name another folder."
         ) from error
     try:
         rows = _rows(scans, _read(folder))

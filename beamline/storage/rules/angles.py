@@ -48,9 +48,9 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "error",
             "angle-spread",
-            f"The angles of the projections reach {farthest:.3g} degrees; expected at most {FARTHEST:g}, "
-            "because larger ones are not exact. Is their unit right? Give them with --angles FILE "
-            "(degrees, one per line).",
+            f"Check the unit of the angles, and give the right angles with --angles FILE (degrees, one per line): "
+            f"the angles of the projections reach {farthest:.3g} degrees. At most {FARTHEST:g} degrees are allowed, "
+            "because larger angles have too large rounding errors.",
         )
         return
     degrees = np.asarray(np.degrees(angles), np.float64)

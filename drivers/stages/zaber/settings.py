@@ -65,8 +65,12 @@ class ZaberSettings(Wiring, StageFigures):
     fires_when_enabled: bool = setting(
         False, "true: a distance trigger also fires at the position where it is enabled."
     )
-    starter: int = setting(1, gt=0)
-    repeater: int = setting(2, "Number of one of the two triggers used.", gt=0)
+    starter: int = setting(
+        1, "Number, in the controller, of the trigger that starts the pulses; used only if `chained` is true.", gt=0
+    )
+    repeater: int = setting(
+        2, "Number, in the controller, of the trigger that repeats the pulse after each step.", gt=0
+    )
     shortest: float = setting(
         SHORTEST, "Shortest time after which a trigger can fire again, at full speed.", unit="s", gt=0
     )

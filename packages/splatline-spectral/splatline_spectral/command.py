@@ -43,8 +43,12 @@ def charges_of(ctx: click.Context, param: click.Parameter, value: str | None) ->
 
 @click.command()
 @click.argument("sources", metavar="SCENE|FILE...", nargs=-1, required=True)
-@click.option("--from", "low", type=_KEV, metavar="KEV", help="First energy in keV; needed for a scene.")
-@click.option("--to", "high", type=_KEV, metavar="KEV", help="Last energy in keV; needed for a scene.")
+@click.option(
+    "--from", "low", type=_KEV, metavar="KEV", help="First energy of the simulated scans in keV. Required for a SCENE."
+)
+@click.option(
+    "--to", "high", type=_KEV, metavar="KEV", help="Last energy of the simulated scans in keV. Required for a SCENE."
+)
 @click.option(
     "--step",
     type=_KEV,

@@ -106,7 +106,7 @@ def test_a_result_without_a_row_is_kept_a_row_without_its_result_is_made_again_a
     refused = beamline(*given)
     other.release()
     assert refused.exit_code == 5
-    assert "until the other batch in out has ended" in refused.output
+    assert "another batch is running in this folder" in refused.output
 
 
 @pytest.mark.parametrize(
