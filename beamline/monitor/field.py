@@ -169,8 +169,10 @@ class MassCheck(Logged):
         "the total absorption differs from that of the first projections, in several projections in a row"
     )
 
-    warn: float = setting(0.03, "relative change of the total absorption", ge=0)
-    frames: int = setting(3, "number of consecutive projections that must exceed the limit", ge=1)
+    warn: float = setting(
+        0.03, "relative change of the total absorption above which projections count as different", ge=0
+    )
+    frames: int = setting(3, "number of consecutive different projections after which there is a warning", ge=1)
 
     start = MassState
 

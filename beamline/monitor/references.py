@@ -74,15 +74,17 @@ class ReferenceLimits:
     together with a fifth of the variance cannot come from offset or readout noise.
     """
 
-    saturated: float = setting(1e-3, "fraction of the pixels of a flat that may be saturated", ge=0, lt=1)
+    saturated: float = setting(1e-3, "largest allowed fraction of saturated pixels in a flat", ge=0, lt=1)
     light_over_noise: float = setting(
         3.0, "least intensity of a flat, in units of the noise of a pixel in a dark", ge=0
     )
-    light_gone: float = setting(0.5, "fraction by which a flat may be darker than the brightest flats", gt=0, lt=1)
-    uneven: float = setting(0.1, "relative change of the intensity between flats of a group", gt=0)
-    unlit: float = setting(0.5, "fraction of the frame that may be without beam in flats", gt=0, le=1)
+    light_gone: float = setting(
+        0.5, "largest allowed loss of intensity of a flat, as a fraction of the brightest flats", gt=0, lt=1
+    )
+    uneven: float = setting(0.1, "largest allowed relative change of the intensity between flats of a group", gt=0)
+    unlit: float = setting(0.5, "largest allowed fraction of a flat without beam", gt=0, le=1)
     light_in_darks: float = setting(
-        0.2, "level and variance of darks, relative to level and variance of flats", gt=0, lt=1
+        0.2, "largest allowed level and variance of darks, as fractions of those of flats", gt=0, lt=1
     )
 
 

@@ -154,7 +154,9 @@ class GhostCheck(Logged):
         "a broad shadow or reflection crosses the field of view and does not rotate with the sample"
     )
 
-    warn: float = setting(0.01, "relative change of the intensity in the middle of the shadow or reflection", ge=0)
+    warn: float = setting(
+        0.01, "relative change in the middle of the shadow or reflection above which there is a warning", ge=0
+    )
     alarm: float = setting(0.8, "relative change above which there is an alarm", ge=0)
 
     start = GhostState
