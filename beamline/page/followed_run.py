@@ -49,37 +49,39 @@ class RunValues:
     planned: int = published("ImagesPlanned", "total number of frames of the scan", -1)
     exposed: int = published("ImagesCollected", "frames exposed", 0)
     stored: int = published("ImagesSaved", "frames in the file", 0)
-    percent: float = published("PercentComplete", "of the frames planned", 0.0, "%")
+    percent: float = published("PercentComplete", "share of the planned frames in the file", 0.0, "%")
     rate: float = published("FrameRate", "frames per second", math.nan, "Hz")
-    time_left: float = published("RemainingTime", "until the last frame", math.nan, "s")
-    mean: float = published("MeanCounts", "of the newest frame", math.nan, "counts")
+    time_left: float = published("RemainingTime", "time until the last frame", math.nan, "s")
+    mean: float = published("MeanCounts", "mean counts of the newest frame", math.nan, "counts")
     beam: float = published("Beam", "last reading of the beam monitor", math.nan)
     warnings: int = published("Warnings", "warnings of the monitor", 0)
     alarms: int = published("Alarms", "alarms of the monitor", 0)
     last_flag: str = published("LastFlag", "check, frame and advice of the last flag", "")
     views: int = published("ReconViews", "projections in the live volume", 0)
-    free: float = published("DiskFree", "of the disk with the scan file", math.nan, "GB")
+    free: float = published("DiskFree", "free space of the disk with the scan file", math.nan, "GB")
     age: float = published("FrameAge", "time since the last frame arrived in the file", math.nan, "s")
     data_rate: float = published("DataRate", "data per second", math.nan, "MB/s")
     residual: float = published(
         "ReconResidual", "relative residual of new projections before the live fit has used them", math.nan
     )
     skipped: int = published("SkippedLines", "messages in the log that are not events", 0)
-    angle: float = published("Angle", "of the newest frame in the file", math.nan, "deg")
+    angle: float = published("Angle", "rotation angle of the newest frame in the file", math.nan, "deg")
     flag_names: tuple[str, ...] = published("FlagNames", "checks of the monitor that flagged frames", ())
     flag_counts: tuple[int, ...] = published("FlagCounts", "flags of each check in FlagNames", ())
     pass_number: int = published("PassNumber", "number of the last finished pass of projections, from 1", 0)
     options: tuple[str, ...] = published(
         "Options", "choices of what to measure after this pass: next, again, offset, retake, enough", ()
     )
-    option_gains: tuple[float, ...] = published("OptionGains", "predicted improvement by each of Options", (), "dB")
+    option_gains: tuple[float, ...] = published(
+        "OptionGains", "predicted improvement by each choice in Options", (), "dB"
+    )
     option_lows: tuple[float, ...] = published("OptionGainsLow", "lower ends of OptionGains", (), "dB")
     option_highs: tuple[float, ...] = published("OptionGainsHigh", "upper ends of OptionGains", (), "dB")
-    option_times: tuple[float, ...] = published("OptionTimes", "time that each of Options needs", (), "s")
+    option_times: tuple[float, ...] = published("OptionTimes", "time that each choice in Options needs", (), "s")
     option_doses: tuple[float, ...] = published(
-        "OptionDoses", "dose of each of Options, as a fraction of the dose of the whole plan", (), "%"
+        "OptionDoses", "dose of each choice in Options, in per cent of the dose of the whole plan", (), "%"
     )
-    option_sizes: tuple[float, ...] = published("OptionSizes", "data of each of Options", (), "GB")
+    option_sizes: tuple[float, ...] = published("OptionSizes", "size of the data of each choice in Options", (), "GB")
     recommended: str = published(
         "Recommended", "the recommended choice of Options; a scan that decides by itself takes this choice", ""
     )
@@ -90,8 +92,12 @@ class RunValues:
         "s",
     )
     decision: str = published("Decision", "the last choice, who made it, and the reason", "")
-    predicted_gain: float = published("PredictedGain", "improvement predicted for an earlier choice", math.nan, "dB")
-    measured_gain: float = published("MeasuredGain", "improvement measured for an earlier choice", math.nan, "dB")
+    predicted_gain: float = published(
+        "PredictedGain", "predicted improvement of the newest choice whose improvement was measured", math.nan, "dB"
+    )
+    measured_gain: float = published(
+        "MeasuredGain", "measured improvement of the newest choice whose improvement was measured", math.nan, "dB"
+    )
 
 
 def choice_of(values: RunValues, word: str) -> Choice:
