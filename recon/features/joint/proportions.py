@@ -33,7 +33,7 @@ _HEAVIEST, _LIGHTER, _TRIALS = 32.0, 3.0, 9
 _IN_TIME = 0.03  # the constant τ
 SOLUTION_STEPS, _TRIAL_STEPS = 60, 20  # number of conjugate-gradient iterations of the solution, and of a test
 TRIAL_STEPS = _TRIALS * _TRIAL_STEPS
-"""Largest number of iterations of all tests and of the solution together."""
+"""Largest number of iterations of all tests together."""
 
 
 @dataclass
@@ -63,11 +63,11 @@ class Proportions:
 
     Attributes:
         projector: projector of all projections.
-        kind: e, [view].
-        shares: c [kind, k].
-        matter: f.
-        data: q.
-        weight: w.
+        kind: e: number of the kind of each projection, [view].
+        shares: c: share of each factor in projections of each kind, [kind, k].
+        matter: f: the known density, [y, x, z].
+        data: q: the measured line integrals, [view, col, row].
+        weight: w: weights of the line integrals, [view, col, row].
         stop: called many times in each step. True ends the computation, with the factors from before the step.
     """
 
