@@ -87,13 +87,13 @@ class MaterialTrial:
         the weight. For packed balls in a can 1.5, 2 and 3 times as wide as the field, this would cost 0.5, 0.8 and 0.7
         dB. For a can 1.06 times as wide they rightly prefer twice the weight, which gains 1.1 dB.
 
-        If the tests are stopped before the last one, there are no levels, because those so far may still be rejected.
+        If the tests are stopped before the last one, no levels are used, because the last tests may reject them.
         """
-        found = self._found()
-        if found is not None and not self._trial.ended:
-            self.best, self.materials = found
+        passing = self._passing()
+        if passing is not None and not self._trial.ended:
+            self.best, self.materials = passing
 
-    def _found(self) -> tuple[F64, MaterialPrior] | None:
+    def _passing(self) -> tuple[F64, MaterialPrior] | None:
         """The residuals and the levels that pass all tests; None: there are no such levels, or the tests were
         stopped.
         """
