@@ -35,6 +35,7 @@ from recon.voxels.voxel_problem import (
     VoxelProblem,
     interleaved,
     largest_eigenvalue,
+    sampled_views,
     whitened,
 )
 
@@ -61,7 +62,6 @@ view.)
 """
 # smallest covered share of 180° with which steps are damped, because the coarse shapes of a missing wedge converge last
 _LEAST_COVERED = 0.9
-_LOOKED_AT = 9  # number of projections of a sweep whose residual is stored
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +234,7 @@ class _Descent:
         data, rays = self._data[part.views], None if self._rays is None else self._rays[part.views]
         self.error += device.replace_by_residual(data, residual, rays)
         if looked_at:
-            some = slice(None, None, max(1, count * len(residual) // _LOOKED_AT))
+            some = sampled_views(count, len(residual))
             unweighted = np.array(device.numpy(residual[some]))
             self.seen.append(whitened(unweighted, None if rays is None else device.numpy(rays[some])))
         if rays is not None:

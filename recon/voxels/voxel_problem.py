@@ -93,7 +93,7 @@ class Sweeps:
         for index in order:
             part, data, weight, scale = self._parts[index]
             residual = part.forward_lines(volume)  # first the model; the data are subtracted next
-            sampled = slice(None, None, max(1, len(self._parts) * len(data) // _LOOKED_AT))
+            sampled = sampled_views(len(self._parts), len(data))
             weights_of_rays = None if weight is None else device.numpy(weight[sampled])
             residuals.append(whitened(device.numpy(data[sampled] - residual[sampled]), weights_of_rays))
             total += device.replace_by_residual(data, residual, weight, scale)
@@ -103,6 +103,11 @@ class Sweeps:
         if volume is not x:
             x[...] = device.numpy(volume)
         return total
+
+
+def sampled_views(subsets: int, n_views: int) -> slice:
+    """The projections of a subset of `n_views` whose residual is kept, so that a sweep over `subsets` keeps about 9."""
+    return slice(None, None, max(1, subsets * n_views // _LOOKED_AT))
 
 
 def whitened(residual: F32, weight: F32 | None) -> F32:

@@ -13,7 +13,7 @@ from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.readers.frames import Frames, Read
 from beamline.storage.readers.transforms import UNPACKED
 from drivers.base.frame import FrameKind
-from recon.base.arrays import Mask
+from recon.base.arrays import I64, Mask
 from recon.base.views import spread
 
 _LOOKED_AT = 3  # frames of each kind that are examined
@@ -70,11 +70,16 @@ def no_data_of(source: ScanSource) -> Mask | None:
     return marked if 0 < marked.mean() < 0.5 else None
 
 
+def examined(source: ScanSource, kind: FrameKind) -> I64:
+    """The rows of at most three frames of this kind, spread over the scan, from which its pixels are judged."""
+    return spread(source.table.of_kind(kind), _LOOKED_AT)
+
+
 def _ends(source: ScanSource) -> list[Mask]:
     """For each sampled flat and projection, the pixels with a marker value; [] if a frame has no such pixel."""
     ends = []
     for kind in (FrameKind.FLAT, FrameKind.PROJECTION):
-        for row in spread(source.table.of_kind(kind), _LOOKED_AT):
+        for row in examined(source, kind):
             ends.append(_end_in(source, int(row)))
             if not ends[-1].any():
                 return []

@@ -19,7 +19,7 @@ from beamline.storage.readers.base import NamedArrays, Opening, Quantity, ScanSo
 from beamline.storage.readers.formats import open_arrays, open_file
 from beamline.storage.readers.formats import scan_format as scan_format
 from beamline.storage.readers.frames import Frames
-from beamline.storage.readers.no_data import marked_source, no_data_of
+from beamline.storage.readers.no_data import examined, marked_source, no_data_of
 from beamline.storage.readers.orders import with_order
 from beamline.storage.readers.reference_files import Images, load_images, overlaid, places_of_flats, stated_references
 from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, with_side_file
@@ -37,12 +37,10 @@ from beamline.storage.readers.transforms import (
     with_kinds,
 )
 from drivers.base.frame import FrameKind
-from recon.base.views import spread
 
 __all__ = ["NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]
 
 _SIGNED = "i1", "i2", "i4"  # signed types, into which the counts of a camera may not fit
-_LOOKED_AT = 3  # frames of each kind that are examined for counts that overflowed
 _PIXELS = 2**27  # largest number of pixels of a frame of which all rows are examined
 
 
@@ -269,9 +267,8 @@ def _true_type(source: ScanSource) -> np.dtype[Any] | None:
 
 def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
     for kind in (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK):
-        rows = source.table.of_kind(kind)
-        if rows.size:
-            some = spread(rows, _LOOKED_AT)
+        some = examined(source, kind)
+        if some.size:
             every = max(1, source.shape[0] * source.shape[1] // _PIXELS, source.frame_bytes // UNPACKED)
             with suppress(DataError):  # an unreadable frame is reported where it is used
                 yield read_known(source, some[:1] if every > 1 else some, slice(None, None, every))
