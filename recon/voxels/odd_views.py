@@ -15,7 +15,7 @@ from recon.base.geometry import Geometry
 from recon.base.noise import deviation_between_neighbours
 from recon.base.view_data import Views
 from recon.base.volume import Grid
-from recon.voxels.one_projection import AskedRays, RayCheck, in_bands
+from recon.voxels.one_projection import BAND, AskedRays, RayCheck, in_bands
 from recon.voxels.projector import projection_images
 
 LIMIT = 12.0
@@ -89,13 +89,14 @@ def odd_views(grid: Grid, views: Views) -> RayCheck[tuple[OddView, ...]]:
 def _odd(differences: F32, edges: F32, geometry: Geometry, side: int) -> tuple[OddView, ...]:
     """The odd projections, found in the `_differences` of all projections."""
     n, order, odd_views = geometry.n_views, np.argsort(geometry.angles, kind="stable"), []
-    differences, edges = differences[order], edges[order]
     for place in range(n):
         first = min(max(place - _AROUND, 0), n - _LEAST_VIEWS)
         neighbours = [k for k in range(first, first + _LEAST_VIEWS) if abs(k - place) > _BESIDE]
-        around = differences[neighbours] ** 2
+        around = differences[order[neighbours]] ** 2
         usual = np.minimum(around, _OUTLIER**2 * (1 + np.median(around, axis=0))).mean(axis=0)
-        score = differences[place] / np.sqrt(np.maximum(uniform_filter(usual, _BROAD) + edges[place] ** 2, 1))
+        score = differences[order[place]] / np.sqrt(
+            np.maximum(uniform_filter(usual, _BROAD) + edges[order[place]] ** 2, 1)
+        )
         worst = np.unravel_index(np.abs(score).argmax(), score.shape)
         peak = float(score[worst])
         if abs(peak) > LIMIT:
@@ -108,11 +109,20 @@ def _odd(differences: F32, edges: F32, geometry: Geometry, side: int) -> tuple[O
 
 def odd_views_memory(geometry: Geometry) -> int:
     """Approximate memory of `odd_views` in bytes, without projections and volume."""
-    views, (rows, cols) = geometry.n_views, geometry.detector_shape
-    side, height = _side(geometry), min(_band(geometry), rows)
-    # while two bands wait for rows, the rows that both need are computed and copied
-    band = (height + 2 * _BLUR) * cols * (cols + 4 * views + 8 * _TOGETHER)
-    return 4 * (band + 7 * views * (rows // side) * (cols // side))
+    views, (rows, cols), grid = geometry.n_views, geometry.detector_shape, Grid.matching(geometry)
+    side, (_, height, width) = _side(geometry), grid.shape
+    cells = (rows // side) * (cols // side)
+    if in_bands(geometry, grid):
+        band = min(BAND, rows)
+        own = min(_band(geometry), rows)
+        around = min(own + 2 * _BLUR, rows)
+        # two bands wait for rows that both need; the slices of a band, and the coefficients and lines of its rays
+        waiting = views * cols * (2 * around * (own < rows) + band)
+        lines = waiting + band * height * width + views * cols * max(40, 2 * band + 16)
+        lines = max(lines, waiting + 10 * min(_TOGETHER, views) * around * cols)
+    else:  # the whole volume as lines, and some projections
+        lines = math.prod(grid.shape) + 14 * min(_AT_A_TIME, views) * rows * cols
+    return 4 * (max(lines, 6 * _AROUND * cells) + 6 * views * cells)
 
 
 def _side(geometry: Geometry) -> int:

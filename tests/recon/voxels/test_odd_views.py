@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from recon.base.geometry import Geometry
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
-from recon.voxels.odd_views import LIMIT, OddView, odd_views
+from recon.voxels.odd_views import LIMIT, OddView, odd_views, odd_views_memory
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
@@ -111,3 +112,34 @@ def test_rows_that_fill_no_cell_count_for_nothing(rng: np.random.Generator) -> N
     views = Projector(geometry, volume.grid).forward(volume.data)
     views += rng.normal(0, SIGMA, views.shape).astype(np.float32)
     assert _found(volume, Views(views, geometry)) == ()
+
+
+@pytest.mark.parametrize(
+    ("views", "rows", "columns", "cone"),
+    [
+        (60, 200, 48, False),
+        (360, 64, 96, False),
+        (400, 32, 64, False),
+        (30, 40, 512, False),
+        (60, 3, 300, False),
+        (40, 96, 96, True),
+        (200, 64, 64, True),
+        (91, 16, 256, True),
+    ],
+)
+def test_the_stated_memory_is_that_of_the_peak(
+    views: int, rows: int, columns: int, cone: bool, rng: np.random.Generator
+) -> None:
+    angles, shape = np.linspace(0, math.pi, views, endpoint=False), (rows, columns)
+    geometry = Geometry.cone(2 * angles, shape, 1.0, 500.0, 700.0) if cone else Geometry.parallel(angles, shape)
+    grid = Grid.matching(geometry)
+    _, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    cylinder = Volume(0.01 * (np.hypot(x, y) < 0.3 * columns).astype(np.float32), grid)
+    noise = rng.normal(0, SIGMA, (views, rows, columns)).astype(np.float32)
+    measured = Views(Projector(geometry, grid).forward(cylinder.data) + noise, geometry)
+    _found(cylinder, measured)  # everything is compiled
+    tracemalloc.start()
+    _found(cylinder, measured)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < odd_views_memory(geometry) < 1.6 * peak
