@@ -179,7 +179,7 @@ class _SlabJob:
             # material.
             if first or not method.needs_matter:
                 raise
-            remark = f"Slices {slab.own.start} to {slab.own.stop - 1} were reconstructed with fista-tv instead: {error}"
+            remark = _with_another_method(slab, FistaTv.name, str(error))
             return by(FistaTv(half_voxels=False), part, box, control), remark  # the plan has no memory for half voxels
 
 
@@ -202,9 +202,16 @@ def _as_they_come(make: Callable[[int], T], numbers: Sequence[int], at_a_time: i
 
 
 def _add(partial: PartialVolume, n: int, result: Reconstruction | None, remark: str, warn: Warn) -> None:
-    partial.add(n, None if result is None else result.volume.data)
+    """Add a slab. `warn` gets its remark, or a sentence if its method is not that of the first slab."""
+    if not remark and result is not None and result.method != partial.kept["method"]:
+        remark = _with_another_method(partial.slabs[n], result.method, result.chosen)
+    partial.add(n, None if result is None else result.volume.data, otherwise=bool(remark))
     if remark:
         warn(remark)
+
+
+def _with_another_method(slab: Slab, method: str, why: str) -> str:
+    return f"Slices {slab.own.start} to {slab.own.stop - 1} were reconstructed with {method} instead: {why}"
 
 
 @contextmanager
@@ -271,6 +278,8 @@ def _finished(partial: PartialVolume, grid: Grid, options: ReconOptions, seconds
     """The result, after all slabs are finished."""
     stored = partial.kept
     settings = {**stored["settings"], "slabs": len(partial.slabs), "slab_halo": options.method.halo}
+    if others := partial.made_otherwise:
+        settings["slices_by_another_method"] = np.array(others)
     history = tuple(Progress(*values) for values in stored["history"])
     return Reconstruction(
         Volume(partial.volume, grid), settings, history, method=stored["method"], seconds=seconds,

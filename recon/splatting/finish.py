@@ -26,7 +26,7 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxel_means
 from recon.voxels.beyond_field import reach_of
 from recon.voxels.iterative import solve_views, watched
-from recon.voxels.methods import PnpDct
+from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.ordered_fista import MANY_SUBSETS, Subsets, ordered_fista, pull_methods, subsets_of
 from recon.voxels.priors import TvWeight, pnp_dct, tv_prox
 from recon.voxels.projector import Projector
@@ -39,6 +39,10 @@ FINISH_SWEEPS = 8
 
 PULLED_SWEEPS = 16
 """Number of iterations with a pull to discrete levels. They follow the total-variation iterations."""
+
+REFINEMENT = "refinement"
+"""Name of the setting that says which method refined the voxels: "fista-tv", "pnp-dct" after it, or a method of `PULLS`
+after it. It is not set if the voxels were not refined."""
 
 _REACH = 1.5  # a Gaussian counts as reaching this many standard deviations of its longest axis
 
@@ -78,8 +82,10 @@ def refine(problem: VoxelProblem, x: F32, weight: TvWeight, strength: float, swe
     count = subsets_of(problem.projector.geometry, MANY_SUBSETS, to_the_end=False)
     parts = Subsets.of(problem, count, to_the_end=False)
     x = ordered_fista(problem, x, weight, parts, sweeps=sweeps, prox=tv_prox(problem, TV_STEPS))
+    problem.decide.settings[REFINEMENT] = FistaTv.name
     if not (problem.go_on.going and strength):
         return x
+    problem.decide.settings[REFINEMENT] = PnpDct.name
     return pnp_dct(replace(problem, go_on=problem.go_on.after(sweeps)), x, strength, steps=PnpDct.iterations)
 
 
@@ -105,6 +111,7 @@ class _Finish:
                 x = refine(problem, x, weight, strength, self.iterations)
                 if not problem.go_on.going:
                     return x
+                problem.decide.settings[REFINEMENT] = method.name
                 return method.pulled(problem, x, weight, materials, self.iterations, to_the_end=False)
         if self.patches:
             patches = choose_patches(problem, weight, trial, PnpDct.iterations)

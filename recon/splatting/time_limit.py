@@ -14,7 +14,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import Clock, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.method_kinds import Iterative
 from recon.base.volume import Grid
-from recon.splatting.finish import FINISH_SWEEPS, PULLED_SWEEPS, finish
+from recon.splatting.finish import FINISH_SWEEPS, PULLED_SWEEPS, REFINEMENT, finish
 from recon.splatting.fit_method import Fit
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import voxelize
@@ -176,6 +176,7 @@ class FinalFit(Iterative):
                 # Gaussians from a fit during the scan do not determine the offset in the middle: -2 dB on grains.
                 refined = FistaTv(half_voxels=False).run(problem, late)  # as its memory is stated
                 volume, sweeps = refined.volume, len(refined.history)
+                decide.settings[REFINEMENT] = FistaTv.name
                 plan = plan._replace(sweeps=self.method.finish)
             else:
                 volume, sweeps = finish(volume, gaussians, problem, plan.sweeps, self.fit.settings, late)

@@ -34,7 +34,7 @@ _PLACES = {
     "state": f"{_SLABS}/state",
     "shared_before": f"{_SLABS}/shared_before",
 }
-_MISSING, _ADDING, _DONE = range(3)
+_MISSING, _ADDING, _DONE, _DONE_OTHERWISE = range(4)  # the last one: finished, by another method than the first slab
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,15 +61,23 @@ class PartialVolume:
 
     def has(self, n: int) -> bool:
         """True if slab n is finished."""
-        return bool(self._maps["state"][n] == _DONE)
+        return bool(self._maps["state"][n] >= _DONE)
 
     @property
     def n_slices_done(self) -> int:
         """Number of slices of the finished slabs."""
         return sum(slab.own.stop - slab.own.start for n, slab in enumerate(self.slabs) if self.has(n))
 
-    def add(self, n: int, data: NDArray[np.float32] | None) -> None:
-        """Store slab n: [z, y, x] of all slices that were reconstructed for it. None: the slab is zero."""
+    @property
+    def made_otherwise(self) -> list[int]:
+        """The slices of the slabs that were added with `otherwise`."""
+        chosen = np.flatnonzero(self._maps["state"] == _DONE_OTHERWISE).tolist()
+        return [z for n in chosen for z in range(self.slabs[n].own.start, self.slabs[n].own.stop)]
+
+    def add(self, n: int, data: NDArray[np.float32] | None, *, otherwise: bool = False) -> None:
+        """Store slab n: [z, y, x] of all slices that were reconstructed for it. None: the slab is zero. `otherwise`:
+        the slab was reconstructed with another method than the first slab.
+        """
         slab, state, volume = self.slabs[n], self._maps["state"], self.volume
         if data is not None:
             shared = _shared(slab)
@@ -83,7 +91,7 @@ class PartialVolume:
                 elif share > 0:
                     volume[z] += share * values
             self._written("volume")
-        state[n] = _DONE
+        state[n] = _DONE_OTHERWISE if otherwise else _DONE
         self._written("state")
         self._maps["done_text"][0] = f"{self.n_slices_done} of {len(volume)} slices"
 
@@ -159,7 +167,7 @@ def slabs_of_partial(path: Path) -> tuple[list[Slab], list[Slab]]:
     _refuse_unusable(path)
     with hdf5.readable(path), opened_whole(path) as file:
         slabs, state = _slabs_in(file[_SLABS]), file[_PLACES["state"]][()]
-    return slabs, [slab for slab, is_at in zip(slabs, state, strict=True) if is_at != _DONE]
+    return slabs, [slab for slab, is_at in zip(slabs, state, strict=True) if is_at < _DONE]
 
 
 def _refuse_unusable(path: Path) -> None:

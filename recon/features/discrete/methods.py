@@ -47,6 +47,7 @@ _REJECTED = len(COUNTS) + 4
 _NO_LEVELS = (
     "this is the volume of fista-tv, because no discrete levels were found that predict held-out projections better"
 )
+_REJECTED_IN_TRIAL = "its levels were rejected, because they do not predict the held-out projections better"
 
 
 @dataclass(frozen=True)
@@ -128,14 +129,19 @@ class Discrete(HalfVoxels):
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """How well the method predicts held-out projections: with the best discrete levels, or with total variation
-        alone if no levels are better.
+        alone if no levels are better. If a simpler candidate has that volume already, the method counts as not tried.
         """
         if trial.weight is None:
             return Prediction(
                 self.name, remark=f"{self.name}: not tried, because no weight of total variation could be chosen"
             )
         trial_result = self._choice(trial, trial.weight)
-        return trial.prediction(self.name, trial_result.best, Prior(trial.weight, materials=trial_result.materials))
+        prior = Prior(trial.weight, materials=trial_result.materials)
+        prediction = trial.prediction(self.name, trial_result.best, prior)
+        same = any(each.residuals == prediction.residuals for each in so_far.predictions)
+        if same and not (trial_result.materials.levels or trial.ended):
+            return Prediction(self.name, remark=f"{self.name}: {_REJECTED_IN_TRIAL}")
+        return prediction
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         decide = control.decide or Decisions(problem.seed)

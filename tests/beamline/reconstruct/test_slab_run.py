@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from weakref import WeakSet
@@ -17,12 +17,14 @@ from weakref import WeakSet
 import numpy as np
 import pytest
 
+import recon
 from beamline.reconstruct import estimate
 from beamline.reconstruct.slab_run import _as_they_come
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.partial_volume import PartialVolume, open_partial
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.forecast import Forecast
+from recon.voxels.methods import FistaTv
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, write_exchange
 
@@ -56,16 +58,16 @@ def interrupt_after(monkeypatch: pytest.MonkeyPatch, slabs: int, *, half: bool =
     """Ctrl-C when so many slabs were added; `half`: in the middle of adding the next one."""
     add, added = PartialVolume.add, list[Any]()
 
-    def adding(self: PartialVolume, n: int, data: np.ndarray | None) -> None:
+    def adding(self: PartialVolume, n: int, data: np.ndarray | None, **more: bool) -> None:
         if len(added) == slabs and not half:
             raise KeyboardInterrupt
         if len(added) == slabs:
             assert data is not None
-            add(self, n, data)
+            add(self, n, data, **more)
             self._maps["state"][n] = 1
             raise KeyboardInterrupt
         added.append(n)
-        add(self, n, data)
+        add(self, n, data, **more)
 
     monkeypatch.setattr(PartialVolume, "add", adding)
 
@@ -97,6 +99,24 @@ def test_a_volume_of_slabs_is_as_any_other(made: Path) -> None:
     found = read_reconstruction(made / "whole.h5")
     assert found.parameters["slabs"] == 3 and "partial" not in found.parameters
     assert (made / "whole.h5").stat().st_size < found.volume.data.nbytes * 1.2  # not with slices that slabs shared
+
+
+def test_a_slab_that_its_method_makes_with_another_one_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As by from-reference, if the reference shows no material in a slab. The record has the method of the first."""
+    run, done = FistaTv.run, list[int]()
+
+    def with_another(self: FistaTv, *given: Any) -> recon.Reconstruction:
+        done.append(len(done))
+        result = run(self, *given)
+        return result if done[-1] != 1 else replace(result, method="sirt", chosen="there is nothing to begin from")
+
+    monkeypatch.setattr(FistaTv, "run", with_another)
+    made = beamline(*FISTA, "-o", "out.h5")
+    record, sentence = read_reconstruction(Path("out.h5")), "were reconstructed with sirt instead: there is nothing to"
+    assert made.exit_code == 0 and made.stderr.count(sentence) == 1, made.output
+    others = np.array(record.parameters["slices_by_another_method"])
+    assert record.method == "fista-tv" and f"Slices {others[0]} to {others[-1]} were reconstructed with" in made.stderr
+    assert others.size == 32 and (np.diff(others) == 1).all()
 
 
 @pytest.mark.slow

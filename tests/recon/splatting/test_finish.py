@@ -110,6 +110,7 @@ def test_reconstruct_finishes_and_says_so() -> None:
     plain, finished = (reconstruct(data, VIEWS, R2(steps=60, gaussians=300, finish=n)) for n in (0, 5))
     assert psnr(_box(), finished.volume.data) > psnr(_box(), plain.volume.data) + 0.5
     assert (plain.settings["finish"], finished.settings["finish"]) == (0, 5)
+    assert "refinement" not in plain.settings and finished.settings["refinement"] == "fista-tv"
     # The model is the fit's, whatever voxels add.
     assert plain.gaussians is not None and finished.gaussians is not None
     np.testing.assert_array_equal(plain.gaussians.means, finished.gaussians.means)

@@ -95,8 +95,23 @@ def test_auto_takes_it_for_grains_and_tries_neither_patches_nor_a_fit() -> None:
 
 
 @pytest.mark.slow
+def test_auto_lists_no_residual_of_rejected_levels() -> None:
+    """It would be that of fista-tv. A choice between other candidates needs it."""
+    data = measured(smooth())
+    beside, alone = (recon.reconstruct(data, VIEWS, recon.Auto(candidates)) for candidates in (
+        (recon.FistaTv(), recon.Discrete()), (recon.Fbp(), recon.Discrete()),
+    ))  # fmt: skip
+    assert beside.method == "fista-tv" and "discrete 0." not in beside.settings["chosen_because"]
+    assert beside.settings["chosen_because"].endswith(
+        "; discrete: its levels were rejected, because they do not predict the held-out projections better"
+    )
+    assert alone.method == "discrete" and "; discrete 0." in alone.settings["chosen_because"]
+
+
+@pytest.mark.slow
 def test_the_finish_of_a_fit_pulls_to_them_too() -> None:
     made = [recon.reconstruct(measured(grains()), VIEWS, recon.R2(steps=60, finish=n)) for n in (None, 8)]
+    assert [each.settings["refinement"] for each in made] == ["discrete", "fista-tv"]
     few, smooth = (error(each.volume.data, grains()) for each in made)
     assert few < 0.8 * smooth
     assert ["levels_of_materials" in each.settings for each in made] == [True, False]
