@@ -28,18 +28,19 @@ _SMALLEST = 64  # detectors with fewer pixels along a side are not binned
 
 @dataclass(frozen=True, eq=False)
 class Auto(Method):
-    """Tries methods on a part of the scan, and takes the simplest method that is about as good as the best one.
+    """Chooses a reconstruction method: `Auto` tests the candidates on a part of the scan, and takes the simplest
+    candidate whose volume predicts the held-out projections about as well as that of the best candidate.
 
-    The measure of a method is how well its volume predicts the held-out projections. `Auto` tries the methods on the
-    sixteen rows with most material; in a cone beam, on the sixteen rows in the middle. If these rows contain little
-    material, it tries the methods on all rows at half the resolution. One of eight projections is held out. Test
-    reconstructions need at least 16 projections; with fewer, `Auto` uses the last candidate. docs/choosing.md gives the
-    reasons.
+    `Auto` tests the candidates on the sixteen rows with most material; in a cone beam, on the sixteen rows in the
+    middle. If the sixteen middle rows of a cone beam contain little material, `Auto` tests the candidates on all rows
+    at half the resolution. The test reconstructions hold out one of eight projections. Test reconstructions need at
+    least 16 projections; with fewer, `Auto` uses the last candidate. The reasons for this way to choose a method are in
+    docs/choosing.md.
 
     Attributes:
         candidates: the methods, the simplest and cheapest first.
-        least_gain: a costlier method is taken only if it lowers the residual in the held-out projections by at least
-            this share.
+        least_gain: smallest fraction by which a costlier method must lower the residual in the held-out projections, so
+            that `Auto` takes it.
     """
 
     name: ClassVar[str] = AUTO
@@ -57,10 +58,10 @@ class Auto(Method):
             raise ValueError("candidates must contain at least one method, got none")
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        """Reconstruct with the chosen method. The result also contains the reason for the choice.
+        """Reconstruct with the method that `choose` returns. The result also contains the reason for the choice.
 
         Raises:
-            ValueError: no candidate can use these projections.
+            ValueError: all projections are zero, or no candidate can use the projections.
         """
         decide = control.decide or Decisions(problem.seed)
         choice = TrialChoice.of(decide("method", lambda: self.choose(problem, control)))
@@ -92,13 +93,13 @@ class Auto(Method):
         """Choose the candidate that predicts the held-out projections best.
 
         Raises:
-            ValueError: no candidate can use these projections.
+            ValueError: all projections are zero, or no candidate can use the projections.
         """
         return self.tried(problem, control)[0]
 
     def tried(self, problem: ReconProblem, control: RunControl) -> tuple[TrialChoice, Trial | None]:
-        """The choice that `choose` returns, and the test reconstructions that led to it. The second value is None if no
-        test reconstruction was made, or if the run was stopped.
+        """The choice that `choose` returns, and the test reconstructions that led to it. Instead of test
+        reconstructions, the function returns None if it made none, or if the run was stopped.
         """
         data = problem.projections
         if not any(np.isfinite(view).any() and np.nan_to_num(view, posinf=0, neginf=0).any() for view in data):
@@ -125,8 +126,9 @@ class Auto(Method):
         return self.candidates
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """With "preview", only the first two candidates are tried. With "best", a costlier method is taken even if
-        it is only slightly better, each test of a fit runs to its end, and the last iterations use half voxels."""
+        """The automatic choice with a quality preset. The preset "preview" tries only the first two candidates. The
+        preset "best" takes a costlier method even if it is only slightly better, runs each test of a Gaussian fit to
+        its end, and uses voxels half as wide in the last iterations."""
         if quality == "standard":
             return self
         best = quality == "best"

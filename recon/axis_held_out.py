@@ -44,21 +44,21 @@ def axis_by_views(
     """The column of the rotation axis with which a volume from two thirds of the projections predicts the other third
     best.
 
-    Start the search within some tenths of the detector's width from the axis, because there the residual has only one
+    Start the search within a fifth of the detector's width from the axis, because there the residual has only one
     minimum. The search begins with coarse steps and halves the step around the best candidate. At the end, the
-    residuals of three candidates are computed on finer pixels. The minimum of the parabola through these three
-    residuals is the result. If the sample is wider than the field of view, the box of voxels is twice as wide. For a
-    180° scan of a sample wider than the field of view in a parallel beam, use `find_axis` instead.
+    residuals of three candidates are computed on finer pixels, and the result is the minimum of the parabola through
+    the three residuals. If the sample is wider than the field of view, the box of voxels is twice as wide as the field
+    of view. For a 180° scan of a sample wider than the field of view in a parallel beam, use `find_axis` instead.
 
     Args:
-        projections: float32 [view, row, col], line integrals; `VIEWS` projections of `COLS` columns are enough.
+        projections: float32 [view, row, col], line integrals; 90 projections (`VIEWS`) of 128 columns (`COLS`) suffice.
         geometry: geometry of these projections; the search begins at its `axis_col`.
-        progress: function that gets the number of candidates tried so far. lit: bool [row, col] or [view, row, col],
-            True for pixels with data; None: all pixels have data.
+        progress: function that gets the number of candidates tried so far.
+        lit: bool [row, col] or [view, row, col], True for pixels with data; None: all pixels have data.
 
     Returns:
-        The estimate. `confident` is False if the residual of the best candidate is nearly as large as the residuals of
-        the others.
+        The estimate. `AxisEstimate.confident` is False if the residual of the best candidate is nearly as large as the
+        residuals of the others.
 
     Raises:
         AxisError: the best candidate is farther from `axis_col` of `geometry` than a fifth of the detector's width, or

@@ -55,16 +55,16 @@ def reconstruct(
     Args:
         projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too). Values that are
             masked or not finite are filled from their neighbours and get weight 0. If photons are few, give the
-            measured `Counts` instead. The method then gets line integrals, with weights that represent the likelihood
-            of the counts (`recon.prep.counts.line_integrals`). The weights from the counts are multiplied by
-            `use.weights`. `Views` contain their geometry, their weights and the reach of the sample, so the reach is
-            not measured again.
+            measured `Counts` instead. From `Counts`, the method gets line integrals with weights that represent the
+            likelihood of the counts (`recon.prep.counts.line_integrals`). The weights from the counts are multiplied by
+            `use.weights`. `Views` contain their geometry, their weights and the reach of the sample, so `reconstruct`
+            does not measure the reach again.
         geometry: geometry of the projections; None for `Views`.
         method: a name ("auto", or see `recon.methods.names`) for a method with its default settings, or a method with
             settings of its own, such as `recon.R2(steps=2000)` or `recon.FistaTv(tv_weight=2e-3)`.
         grid: grid of the volume; None: one voxel per detector pixel. A fit always covers everything that the
-            projections see. So if you ask for a smaller box, the voxels in the box are identical to those of the whole
-            volume.
+            projections see. Therefore the voxels of a smaller box that you ask for are identical to the same voxels of
+            the whole volume.
         seed: seed of every random choice. The same seed gives the same volume on the same machine with the same number
             of threads.
         device: where the method computes: "cpu" or "cuda" (the current CUDA device).
@@ -72,10 +72,10 @@ def reconstruct(
         control: how to follow, stop and resume the reconstruction.
 
     Raises:
-        ValueError: the method is unknown, something that `Views` contain is given twice, shapes do not match, all
-            projections are from one side, the axis is outside the detector, the projections show no material, the seed
-            is negative, or the method cannot use the projections, the held-out projections, the device or the
-            checkpoint.
+        ValueError: the method is unknown, `Views` are given together with something that `Views` contain (a geometry,
+            weights, held-out projections or a sample radius), shapes do not match, all projections are from one side,
+            the axis is outside the detector, the projections show no material, the seed is negative, or the method
+            cannot use the projections, the held-out projections, the device or the checkpoint.
 
     Warns:
         UserWarning: values with a weight are not finite, angles look like degrees, the projections look like counts,

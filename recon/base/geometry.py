@@ -55,22 +55,23 @@ class Geometry:
     Attributes:
         angles: float64 [view], radians, any order, any range.
         detector_shape: (rows, cols) in pixels.
-        pixel_pitch: size of a detector pixel in mm. For a parallel beam, the size is measured at the sample; for a cone
-            beam, on the detector. If the pitch of a parallel beam is 1.0, all lengths are in pixels.
+        pixel_pitch: size of a detector pixel in mm. For a parallel beam, the pixel size is measured at the sample; for
+            a cone beam, on the detector. If the pixel pitch of a parallel beam is 1.0, all lengths are in pixels.
         axis_col, axis_row: column of the rotation axis, and row of the height z = 0, on the detector. For a cone beam,
-            the row is that of the central ray. `axis_col` and `axis_row` are in pixels, 0 at the centre of the first
-            column or row.
+            `axis_row` is the row that the central ray meets. `axis_col` and `axis_row` are in pixels, 0 at the centre
+            of the first column or row.
         sod, sdd: mm from the source to the rotation axis and to the detector; both infinite for a parallel beam.
         shifts: float64 [view, 2], displacement of each projection in pixels (col, row).
         roll: float64 [view], radians; rotation of the detector about the beam. The column number of the rolled detector
             grows along u cos(roll) + v sin(roll).
         tilt: float64 [view], radians; tilt of the rotation axis along the beam. The row number of a tilted projection
             grows along v cos(tilt) + d sin(tilt), with d the direction of the beam.
-        width: the causes that make rays wide (`RayWidth`); the same for all rays.
+        width: how wide rays are (see `RayWidth`); the same for all rays.
         skew: angle in radians by which the stage turns from the readout of one row to the next (parallel beam only);
             `angles` are the angles of the first row.
         centres: float64 [view, 3], (x, y, z) in mm (cone beam only): the point that lies at the distance `sod` from the
-            source, along the beam of the projection. If `centres` is left out, this point is the origin.
+            source, along the beam of the projection. If `centres` is left out, the point is the origin in all
+            projections.
     """
 
     angles: F64
@@ -114,7 +115,7 @@ class Geometry:
         """Parallel beam.
 
         Args:
-            where: `axis_col`, `axis_row`, `shifts`, `roll` and `tilt` by keyword, see `Where`.
+            where: the keyword arguments `axis_col`, `axis_row`, `shifts`, `roll` and `tilt`, see `Where`.
 
         Raises:
             ValueError: there are no angles, an angle is not finite, the detector is empty, or the pitch is not
@@ -139,10 +140,11 @@ class Geometry:
         Args:
             pixel_pitch: mm, in the plane of the detector; at the rotation axis a pixel is smaller by the factor sod /
                 sdd.
-            where: `axis_col`, `axis_row`, `shifts`, `roll` and `tilt` by keyword, see `Where`.
+            where: the keyword arguments `axis_col`, `axis_row`, `shifts`, `roll` and `tilt`, see `Where`.
 
         Raises:
-            ValueError: as for `parallel`, or the distances are not finite with 0 < sod <= sdd.
+            ValueError: an argument that `Geometry.parallel` would not accept either, or distances that are not finite
+                with 0 < sod <= sdd.
         """
         check_arguments(cls.cone, locals())
         if not 0 < sod <= sdd <= LONGEST or sdd > _MAGNIFIED * sod:
@@ -171,7 +173,7 @@ class Geometry:
             shifts: [view], pixels along the line.
 
         Raises:
-            ValueError: as `cone`.
+            ValueError: for the same reasons as `Geometry.cone`, or `shifts` are not one number for each angle.
         """
         check_arguments(cls.fan, locals())
         if shifts is not None and np.shape(shifts) != np.shape(np.atleast_1d(angles)):
@@ -214,8 +216,8 @@ class Geometry:
         """Whether the sample moves along the rotation axis by half the height of the detector or more, as in a helical
         scan.
 
-        Only the middle half of the sorted displacements counts, so that single displaced projections have no effect. In
-        a helical scan, the middle half spans half of the full displacement.
+        Only the middle half of the displacements, sorted by size, counts, so that single displaced projections have no
+        effect. In a helical scan, this middle half of the displacements spans half of the full displacement.
         """
         low, high = np.percentile(self.offsets[:, 1], (25, 75))
         return bool(4 * (high - low) >= self.detector_shape[0])
@@ -231,9 +233,10 @@ class Geometry:
         """Angle in radians after which projections repeat the same rays: π for a parallel beam with the axis in the
         middle, otherwise 2π.
 
-        The period is 2π in three cases. (1) The beam is a cone. (2) The axis is tilted along the beam so much that the
-        edge of the field of view moves by more than half a pixel. (3) The axis is off the detector's middle by more
-        than a twentieth of the detector's width: opposite projections then see different parts of the sample.
+        The period is 2π for a cone beam. The period is also 2π if the axis is tilted along the beam so much that the
+        edge of the field of view moves by more than half a pixel. If the axis is off the detector's middle by more than
+        a twentieth of the detector's width, the period is 2π, because opposite projections then see different parts of
+        the sample.
         """
         leans = self.reach * float(np.abs(np.sin(self.tilt)).max()) > 0.5 * self.sample_pitch
         return 2 * math.pi if self.is_cone or leans or self.is_off_middle else math.pi
@@ -242,8 +245,8 @@ class Geometry:
     def unseen_cone(self) -> float:
         """Half angle in radians of the cone about the rotation axis, in Fourier space, that no projection measures.
 
-        This angle is the smallest tilt of the axis along the beam. The angle is 0 if this tilt moves the edge of the
-        field of view by at most half a pixel.
+        The half angle is the smallest tilt of the axis along the beam among all projections. The half angle is 0 if
+        the smallest tilt moves the edge of the field of view by at most half a pixel.
         """
         least = float(np.abs(self.tilt).min())
         return least if self.reach * math.sin(least) > 0.5 * self.sample_pitch else 0.0
@@ -295,7 +298,8 @@ class Geometry:
     def reach(self) -> float:
         """Distance in mm, at the rotation axis, from the axis to the farthest detector edge of any projection.
 
-        Roll is ignored, and so are laterally offset projections. For a wide cone the value is limited to 0.7 sod.
+        The roll of the detector and laterally offset projections are ignored. For a wide cone, the distance is limited
+        to 0.7 of the distance from the source to the rotation axis.
         """
         cols, axis = self.detector_shape[1], (self.axis_col + self.offsets[:, 0])[self.is_centred]
         reach = max(axis.max() + 0.5, cols - 0.5 - axis.min()) * self.sample_pitch
@@ -323,8 +327,8 @@ class Geometry:
         )
 
     def origin(self, view: int) -> tuple[float, float]:
-        """Pixel (col, row) at which one projection shows the origin of the object's frame, or the centre of the
-        projection if it has one (see `centres`)."""
+        """Pixel (col, row) at which one projection shows the origin of the object's frame. If the geometry has
+        `centres`, the pixel at which the projection shows its own centre."""
         return self.axis_col + float(self.shifts[view, 0]), self.axis_row + float(self.shifts[view, 1])
 
     def __repr__(self) -> str:
@@ -361,7 +365,8 @@ class Geometry:
 
         Raises:
             ValueError: there are no angles, an angle is not finite, or shift, roll, tilt or centre differ between
-                projections. If they differ, their values at a new angle are unknown.
+                projections. The values of a shift, roll, tilt or centre that differs between projections are unknown
+                at a new angle.
         """
         for name in _OF_VIEWS[1:]:
             widest = float(np.ptp(getattr(self, name), axis=0).max())
@@ -392,11 +397,11 @@ class Geometry:
         return replace(self, **lengths, centres=frozen(factor * self.centres))
 
     def seen_with(self, width: RayWidth, skew: float = 0.0) -> Geometry:
-        """The same projections with rays of this width, and with this skew (see the attributes of `Geometry`).
+        """The same projections with the ray width `width` and the skew `skew` (see the attributes of `Geometry`).
 
         Raises:
-            ValueError: the skew is not finite. A skew other than 0 also raises the error for a cone beam, and for
-                rolled or tilted projections, because one detector row then sees several slices.
+            ValueError: the skew is not finite; or the skew is not 0 and the beam is a cone, or projections are rolled
+                or tilted. (One detector row of a cone beam, or of a rolled or tilted detector, sees several slices.)
         """
         return replace(self, width=width, skew=float(skew))
 
@@ -420,9 +425,9 @@ class Geometry:
     def rows(self, start: int, stop: int) -> Geometry:
         """The same geometry for detector rows start..stop.
 
-        For a parallel beam, z = 0 moves to the middle of these rows, so that a slab can be treated as a separate scan.
-        For a cone beam, the central ray and the point about which projections are rolled and tilted stay where they
-        are.
+        For a parallel beam without roll and tilt, z = 0 moves to the middle of the detector rows start..stop, so that a
+        slab can be treated as a separate scan. For a cone beam, and for rolled or tilted projections, the central ray
+        and the point about which projections are rolled and tilted stay at z = 0.
         """
         rows = self.detector_shape[0]
         if not 0 <= start < stop <= rows:
@@ -436,7 +441,8 @@ class Geometry:
     def binned(self, factor: int) -> Geometry:
         """The geometry after binning by factor x factor; trailing rows and columns that do not fill a bin are dropped.
 
-        As in `rows`, for a straight parallel beam z = 0 moves to the middle of the remaining rows.
+        For a parallel beam without roll and tilt, z = 0 moves to the middle of the remaining rows, as in
+        `Geometry.rows`.
         """
         if operator.index(factor) < 1:
             raise ValueError(f"the bin factor must be 1 or more, got {factor}")

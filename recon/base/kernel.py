@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 class Kernel(StrEnum):
     """Profile f(q) of a Gaussian; q is the square of the distance from the centre in standard deviations, f(0) = 1.
 
-        gaussian       exp(-q / 2)
-        compact:1.5    (1 - q / R²)₊^m,   m = 3/2,   R² = 2 m + 5
+    The kernel `gaussian` is f(q) = exp(-q / 2). The kernel `compact:1.5` is f(q) = (1 - q / R²)₊^m with m = 3/2 and
+    R² = 2 m + 5. This radius R gives both kernels the same second moment, so a covariance describes the same width for
+    both kernels.
 
-    R is chosen so that both kernels have the same second moment. Therefore a covariance describes the same width for
-    both kernels. The line integral of the compact kernel has the same form with exponent m + 1/2, which is a polynomial
-    for m = 3/2. The compact kernel has a finite radius, so it need not be cut off. ∫ (1
-    - t² - s²)₊^m ds = √π Γ(m + 1) / Γ(m + 3/2) (1 - t²)₊^(m + 1/2). The projection of the compact kernel is steeper at
-    the edge and has no tail. The compact kernel suits samples with sharp edges.
+    The line integral of the compact kernel has the same form with exponent m + 1/2, which is a polynomial for m = 3/2:
+    ∫ (1 - t² - s²)₊^m ds = √π Γ(m + 1) / Γ(m + 3/2) (1 - t²)₊^(m + 1/2). The compact kernel ends at a finite radius,
+    while a Gaussian kernel must be cut off. The projection of the compact kernel is steeper at its edge than that of a
+    Gaussian, and has no tail. The compact kernel suits samples with sharp edges.
     """
 
     GAUSSIAN = "gaussian"
@@ -63,7 +63,7 @@ class Kernel(StrEnum):
 
     @property
     def length(self) -> float:
-        """Integral along a line through the centre, with the length in standard deviations."""
+        """Integral of the profile along a line through the centre; the unit of length is a standard deviation."""
         if not self.is_compact:
             return math.sqrt(2 * math.pi)
         m = self.exponent
@@ -71,7 +71,8 @@ class Kernel(StrEnum):
 
     @property
     def affine_terms(self) -> tuple[float, float, float, float]:
-        """Factors of βᵀΣ₂β, αᵀΣ₂β, αᵀΣ₂α and η² in the error of an affine footprint, see `kernels.cpu.footprints`."""
+        """Factors of the terms βᵀΣ₂β, αᵀΣ₂β, αᵀΣ₂α and η² in the error of an affine footprint; `kernels.cpu.footprints`
+        defines these terms."""
         return (2 / 3, 4 / 3, 10 / 3, 256 / 21) if self.is_compact else (1 / 2, 1.0, 3 / 2, 6.0)
 
     def reach(self, sigmas: float) -> float:

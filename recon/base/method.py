@@ -49,8 +49,8 @@ class Progress:
             latest steps used.
         n_gaussians, n_views: number of Gaussians in the model and of projections in the data.
         held_out: ||rendered - measured|| / ||measured|| of the held-out projections; NaN if there are none.
-        unit: what `step` counts. It is empty for fitting steps and iterations. Otherwise it is the unit of a direct
-            method or of other work, such as "slices", and loss and residual are NaN.
+        unit: what `step` counts. The text `unit` is empty for fitting steps and iterations. For a direct method or
+            other work, `unit` names what is counted, such as "slices", and loss and residual are NaN.
     """
 
     step: int
@@ -104,8 +104,8 @@ class RunControl(Checked):
             every sixteen slices of FBP.
         on_checkpoint: function that gets the checkpoint of a fit every `checkpoint_every` s.
         resume: checkpoint from which a fit with the same data and settings continues.
-        decide: records the decisions that the method derives from its data. If it contains the decisions of an earlier
-            run, the method repeats them. If `decide` is None, the method decides by itself.
+        decide: records the decisions that the method derives from its data. If `decide` contains the decisions of an
+            earlier run, the method repeats these decisions. If `decide` is None, the method decides by itself.
         stop_trials: function that is called after each iteration of the test reconstructions that choose the weight of
             total variation. If `stop_trials` returns True, only the test reconstructions end. None: same as
             `should_stop`.
@@ -122,15 +122,15 @@ class RunControl(Checked):
 
     @property
     def stop(self) -> Stop:
-        """The `Stop` that methods call between steps. The call returns True if the run must end with the volume reached
-        so far.
+        """The `Stop` that methods call between steps. The `Stop` returns True if the run must end with the volume
+        reached so far.
         """
         return self.should_stop if isinstance(self.should_stop, Stop) else Stop(self.should_stop or _never)
 
     @property
     def stop_of_trials(self) -> Callable[[], bool]:
-        """The function that test reconstructions call between iterations. It returns True if the test reconstructions
-        must end.
+        """The function that test reconstructions call between iterations. The function returns True if the test
+        reconstructions must end.
         """
         return self.stop_trials or self.stop
 
@@ -141,12 +141,12 @@ class RunControl(Checked):
 
     def report_progress(self, step: int, steps: int, begin: float, n_views: int, unit: str) -> None:
         """Report progress without a residual, for a direct method or for a part of the work. `begin` is the time at
-        which this work began."""
+        which the direct method or the part of the work began, in s on the clock of this control."""
         if self.on_progress is not None:
             self.on_progress(Progress(step, steps, self.now() - begin, math.nan, math.nan, 0, n_views, unit=unit))
 
     def by(self, deadline: float) -> RunControl:
-        """The same control with a deadline: the run ends when the clock of this control shows `deadline` (s)."""
+        """This control with a deadline: the run ends when the clock `now` of this control shows `deadline` (s)."""
         return replace(self, should_stop=self.stop.by(deadline, self.now))
 
 
@@ -229,17 +229,16 @@ class Reconstruction:
         volume: the attenuation, `volume.data` float32 [z, y, x] in 1/mm.
         settings: every parameter that was used.
         history: progress of the fit or the iterations; empty for a direct method.
-        gaussians: the Gaussian model of a fit, a `recon.splatting.gaussians.Gaussians` (this module must not import
-            it); None for other methods.
+        gaussians: the Gaussian model of a fit (a `recon.splatting.gaussians.Gaussians`); None for other methods.
         checkpoint: state of a fit for `RunControl.resume`; see `checkpoint.arrays_of`.
         method: name of the method; for `recon.Auto`, of the chosen method. `run` may leave `method` empty for the
-        caller to fill in. seconds: wall time of the reconstruction. `run` may leave `seconds` 0 for the caller to fill
-            in.
+            caller to fill in.
+        seconds: wall time of the reconstruction in s. `run` may leave `seconds` 0 for the caller to fill in.
         deviation: standard deviation of each voxel, see `recon.error_bars`; None: not computed.
         series: all volumes of a method that makes several volumes; the first one is also `volume`; None for a method
             that makes one volume.
-        at: function that returns the volume [z, y, x] at a time (as in `DataUse.times`), or for the number of an
-            energy; None for a method that makes one volume.
+        at: function that returns the volume [z, y, x] at a time (in s, as in `DataUse.times`), or at an energy, given
+            by its number; None for a method that makes one volume.
         chosen: how an automatic choice or a preset found the settings; empty if they were given.
         started_from: number of Gaussians at the start of a fit; 0 for other methods.
         ending: how the run ended. The caller of `run` fills in `ending`.
@@ -285,7 +284,7 @@ class Reconstruction:
 
         The file contains the arrays of `Volume.save`, and `method`, `seconds` and `settings`. `settings` is JSON that
         also contains NaN and Infinity, as Python writes them. If there are several volumes in time, the file also
-        contains `series` float32 [volume, z, y, x] and `series_s`.
+        contains `series` float32 [volume, z, y, x], and `series_s`, the time of each volume in s.
         """
         several = {} if self.series is None else {"series": self.series.data, "series_s": self.series.seconds}
         self.volume.save(

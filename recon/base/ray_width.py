@@ -11,10 +11,10 @@ from recon.base.setting import NonNegative
 @dataclass(frozen=True)
 class RayWidth(Checked):
     """The causes that make a ray wide: the area over which a pixel averages, the blur, and the rotation during the
-    exposure. If all are 0, a ray is a line.
+    exposure. If `pixel`, `blur` and `arc` are all 0, a ray is a line.
 
     Attributes:
-        pixel: side, in pixels, of the square over which a pixel averages; 1: its own area.
+        pixel: side, in pixels, of the square over which a pixel averages; 1: the area of the pixel itself.
         blur: standard deviation in pixels of a Gaussian blur of the detector (scintillator, optics).
         arc: angle in radians by which the stage turns during an exposure. The angle of a projection is the angle at the
             middle of its exposure.
@@ -29,7 +29,8 @@ class RayWidth(Checked):
 
     @property
     def variance(self) -> float:
-        """Variance along columns and along rows of the averaged area, in px²."""
+        """Variance of a ray in px², from the area of the pixel and the blur. The variance along columns is equal to the
+        variance along rows."""
         return self.pixel**2 / 12 + self.blur**2
 
     def binned(self, factor: int) -> RayWidth:

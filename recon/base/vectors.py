@@ -34,18 +34,18 @@ def geometry_of_vectors(vectors: ArrayLike, detector_shape: tuple[int, int], *, 
     a cone from any source.
 
     The detector pixels are squares of one size. For a parallel beam, the detector is perpendicular to the beam. For a
-    cone, the distance from the source to the detector is the same in all projections. The origin need not be projected
-    to the centre of the detector.
+    cone, the distance from the source to the detector is the same in all projections. The origin (x, y, z) = 0 need not
+    be projected to the centre of the detector.
 
     Args:
-        vectors: float [view, 12], in mm; see the module.
+        vectors: float [view, 12], in mm; the docstring of `recon.base.vectors` defines the twelve numbers.
         detector_shape: (rows, cols) in pixels.
         cone: True: the first three values are the source; False: the first three values are the direction of the beam
             (with either sign).
 
     Raises:
-        ValueError: the vectors have another shape, or are not finite. Or the vectors of a projection do not describe a
-            detector with square pixels (tolerance: `TOLERANCE`).
+        ValueError: the shape of the vectors is not [view, 12], the vectors are not finite, or the vectors of a
+            projection do not describe a detector with square pixels (tolerance: `TOLERANCE` pixels at the corners).
     """
     check_arguments(geometry_of_vectors, locals())
     given = np.asarray(vectors, np.float64)

@@ -57,11 +57,12 @@ class Grid:
 
         If projections are shifted, the function counts how many projections see each position along the columns and
         along the rows. The grid covers the positions that are seen at least half as often as the position that is seen
-        most. Therefore small alignment shifts change nothing, and a scan that steps up and down gives all heights.
+        most. Therefore small alignment shifts do not change the grid, and the grid of a scan that steps up and down
+        covers all heights.
 
         If the axis is off the detector's middle (`Geometry.is_off_middle`), the box contains the field of view of a
-        360° scan, as in `of_field`. The box is this large because material that
-        projections see outside the box would appear in other voxels.
+        360° scan, as in `of_field`. A smaller box would not do, because material that projections see outside the box
+        would appear in the voxels of the box.
         """
         check_arguments(cls.matching, locals())
         across, (down, middle) = _spread(geometry, 0)[0], _spread(geometry, 1)
@@ -76,8 +77,8 @@ class Grid:
 
         The box includes everything that shifted projections see, and it exists even if the axis is outside the
         detector. Roll and tilt are ignored. The field of view of a cone is measured at the rotation axis. Few
-        projections see material outside this field of view: this material is in the beam only at angles at which it is
-        far from the source. The box of a wide cone ends before it reaches the source.
+        projections see material outside the field of view, because such material is in the beam only at angles at which
+        it is far from the source. The box of a wide cone ends before it reaches the source.
         """
         low, high = geometry.heights
         across, along = 2 * geometry.reach / voxel_size, (high - low) / voxel_size
@@ -88,13 +89,12 @@ class Grid:
 
     @classmethod
     def for_fit(cls, geometry: Geometry, wanted: Grid, *, wider: bool = False) -> Grid:
-        """The box that a fit covers: the whole field of view, in voxels of the requested size.
+        """The box that a Gaussian fit covers: the whole field of view, in voxels of the size of the grid `wanted`. If
+        `wider` is True (for a sample that is wider than the field of view), the box is at least as wide as the grid
+        `wanted`.
 
-        `wider`: True for a sample that is wider than the field of view. If `wider` is True, the box is as wide as the
-            requested box.
-
-        The voxel size is between one and four pixels. Projections resolve nothing finer than a pixel, and a fit cannot
-        start from a volume coarser than four pixels.
+        The voxel size of a fit is between one and four pixels. Projections resolve nothing finer than a pixel, and a
+        fit cannot start from a volume coarser than four pixels.
         """
         pixel = geometry.sample_pitch
         edge = min(max(wanted.voxel_size, pixel), COARSEST * pixel)
@@ -226,7 +226,7 @@ class Volume:
         """Write the volume to the new file `path`, an .npz; `beamline export` converts it.
 
         The file contains the arrays `volume` float32 [z, y, x] in 1/mm, `voxel_mm`, `slice_mm` (the edge along z),
-            `centre_zyx_mm`, and `facts`. The file is written completely or not at all.
+        `centre_zyx_mm`, and each value of `facts` under its name. The file is written completely or not at all.
 
         Raises:
             ValueError: the suffix is not .npz.

@@ -124,8 +124,8 @@ class WithoutRings:
 
     Attributes:
         data: float32 [view, row, col], line integrals.
-        taken: float32 [row, col], the removed part, averaged over the projections. sentence: a sentence that describes
-            the removal.
+        taken: float32 [row, col], the part that was removed from the line integrals, averaged over the projections.
+        sentence: a sentence that says which stripes were removed.
     """
 
     data: F32

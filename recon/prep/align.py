@@ -219,20 +219,24 @@ def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
 def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
     """The rotation axis (centre of rotation) of a scan, from all projections.
 
-    First, all projections are used together. If this shows no axis and the scan covers 360°, pairs of opposite
-    projections are used, because in half acquisition the axis is near an edge of the detector. In a 180° scan of a
-    sample wider than the field of view, the two ends of the scan are used, or a pair of opposite projections.
+    First, `find_axis` uses all projections together. If all projections together show no axis and the scan covers 360°,
+    `find_axis` uses pairs of opposite projections, because in half acquisition the axis is near an edge of the
+    detector. In a 180° scan of a sample wider than the field of view, the two ends of the scan are used, or a pair of
+    opposite projections.
 
     Args:
         projections: float32 [view, row, col], line integrals.
         angles: [view], radians.
 
-    Returns: The estimate from all projections, if it is confident. If it is not confident: a confident estimate from
-        opposite projections, from the two ends of the scan, or from one pair of projections. If no estimate is
-        confident, the estimate from all projections.
+    Returns:
+        The estimate from all projections, if it is confident. If the estimate from all projections is not confident,
+        the function returns a confident estimate from opposite projections, from the two ends of the scan, or from one
+        pair of projections. If no estimate is confident, the function returns the estimate from all projections.
 
     Raises:
-        ValueError, AxisError: for the same reasons as `axis_from_sinogram`.
+        ValueError: `axis_from_sinogram` cannot use the projections or the angles.
+        AxisError: all projections together show no axis, and neither opposite projections nor the ends of the scan
+            show one.
 
     Warns:
         UserWarning: angles look like degrees, or projections look like counts or transmission.

@@ -90,8 +90,8 @@ class Counts:
             )
 
     def photons(self, view: int) -> tuple[F64, F64, F64]:
-        """Three images [row, col] of a projection: the counted photons plus v, the photons without the sample plus v,
-        and v. Here v is the variance of a dark frame in units of photons², see `Counts`.
+        """Three images [row, col] of a projection: the counted photons (at least -v), the photons without the sample,
+        and v. In these images, v is the variance of a dark frame in photons², see `Counts`.
 
         If the flat of a pixel is not above the dark, the photons without the sample are 0. If the counts of a pixel are
         NaN, its photons are NaN.

@@ -51,8 +51,9 @@ class CorrectionSettings:
         air: number of columns (left, right) that see no sample in any projection, or "auto" to find them, or "none".
             Each projection is divided by the level of its air columns. If both sides have air columns, the projection
             is divided by a straight line between the levels of the left and the right side.
-        sample_from: limit of the line integral at the edges of the detector. If the line integral is larger, "auto"
-            assumes that the edges show the sample and not air, see `references.edge_depth`.
+        sample_from: limit of the line integral at the edges of the detector. If the line integral at the edges is
+            larger than `sample_from`, the setting "auto" of `air` assumes that the edges show the sample and not air,
+            see `references.edge_depth`.
     """
 
     floor: float = 1e-4

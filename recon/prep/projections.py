@@ -30,7 +30,8 @@ class Projections:
         weights: float32 [view, row, col], inverse variances of the line integrals, from the expected photons; 0 for
             masked pixels; None if photons were not counted.
         unmeasured: int64 [run, 4], runs of pixels without data in one projection, which were filled from their
-            neighbours. The four numbers are the projection, the row, the first column, and the column after the last.
+            neighbours. The four numbers of a run are the projection, the row, the first column, and the column after
+            the last column.
         spots_left: number of pixels in zingers that were too large to be filled, in these projections and all earlier
             ones.
     """
@@ -48,8 +49,8 @@ class Projections:
 
     @property
     def lit(self) -> Mask | None:
-        """bool [view, row, col], True for pixels with data; None if all pixels have data. (Interpolated single lines
-        count as data.)
+        """bool [view, row, col], True for pixels with data; None if all pixels have data. Masked pixels count as pixels
+        without data only in areas of 3 x 3 pixels or more.
         """
         lit = np.repeat(~areas(self.masked)[None], len(self.data), axis=0)
         index_of = {int(view): number for number, view in enumerate(self.view_ids)}

@@ -22,17 +22,19 @@ _PARAMETERS = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "raw_dens
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """σ(x) = Σ_i ρ_i f((x - p_i)ᵀ Σ_i⁻¹ (x - p_i)),  Σ = R S² Rᵀ,  f(q) = exp(-q/2)   (Zha et al. 2024).
+    """A sum of Gaussians: σ(x) = Σ_i ρ_i f((x - p_i)ᵀ Σ_i⁻¹ (x - p_i)), Σ = R S² Rᵀ, f(q) = exp(-q/2) (Zha et al.
+    2024).
 
-    With another kernel f, the elements are still called Gaussians, and S still contains their standard deviations.
+    With a kernel f other than exp(-q/2), the elements of the sum are still called Gaussians, and S still contains their
+    standard deviations.
 
     Attributes:
         means: [n, 3] mm, (x, y, z).
         log_scales: [n, 3], logarithms of standard deviations in mm along the Gaussian's own axes.
         quaternions: [n, 4] (w, x, y, z), rotations; their length need not be 1, but must not be 0.
         raw_densities: [n]; ρ = density_unit * softplus(raw), so a density is never negative.
-        density_unit: a typical density in 1/mm. A density is a multiple of this unit, and its raw density
-            sets only the multiple. Therefore raw densities and their learning rates are the same in any unit of length.
+        density_unit: a typical density in 1/mm. A density is a multiple of the density unit, and its raw density sets
+            only the multiple. Therefore raw densities and their learning rates do not depend on the unit of length.
         kernel: radial profile f.
     """
 

@@ -39,8 +39,9 @@ class R2(Fit):
         steps: number of steps; 0: the result is the starting point; None: 400 steps, or, if `seconds` is given, as many
             steps as the time allows.
         seconds: time limit of the whole run by the caller's clock: start, steps, voxel refinement and volume. The
-            learning rates decay over this time. It includes the compilation of kernels, unless `warm_up`
-            was called before. The fit always makes its start and its first step, even if the time is too short.
+            learning rates decay over the time `seconds`. The time `seconds` includes the compilation of kernels, unless
+            `warm_up` was called before. The fit always makes its start and its first step, even if `seconds` is too
+            short for them.
         gaussians: number of Gaussians at the start, or the Gaussians to start from; None: a number derived from the
             detector.
         start: volume from which the first Gaussians are sampled, see `initialise.first_volume`.
@@ -48,9 +49,9 @@ class R2(Fit):
             the lowest residual.
         finish: iterations of the voxel refinement after the fit, see `finish.finish`. If `finish` is None, there are 8
             iterations; discrete levels or steps of PnP-DCT follow if one of these predicts held-out projections better.
-            `Reconstruction.gaussians` is the fitted model in every case.
+            `Reconstruction.gaussians` is the fitted model before the voxel refinement.
         allow_negative: True: the voxel refinement keeps voxels below zero. (Gaussians are never negative.)
-        fit: weights, learning rates and limits.
+        fit: further settings of the fit: weights of the loss terms, learning rates and limits.
     """
 
     name: ClassVar[str] = "r2"
@@ -94,9 +95,10 @@ class R2(Fit):
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The residuals of the method's volume in the held-out projections.
 
-        Usually the test makes a quarter of the steps, and all steps only if the result is then undecided, see
-        `trial_fit.predict`. The method runs unchanged, with its own end and voxel refinement, in these cases: `finish`,
-        `seconds` or `early_stop` is set; the fit starts from given Gaussians; the trial has no prior.
+        Usually the test of the fit makes a quarter of the steps, and makes all steps only if a quarter does not decide
+        whether the fit is best, see `trial_fit.predict`. The test runs the method unchanged, with its own end and voxel
+        refinement, in these cases: `finish`, `seconds` or `early_stop` is set; the fit starts from given Gaussians; the
+        trial could not choose a regularisation weight.
         """
         by_other_settings = self.finish is not None or self.seconds is not None or isinstance(self.gaussians, Gaussians)
         if by_other_settings or self.early_stop or trial.prior is None:

@@ -193,20 +193,21 @@ class FitSettings:
         tv_weight: weight of total variation; None: 3e5 s² / n, where n is the number of pixels that a Gaussian covers,
             and s is the noise of a pixel, divided by the density unit and by half the width of the field of view. If
             the sample changes by more than 0.16 of the density unit per voxel, the weight falls with the square of this
-            change. The weight is at most 0.25.
+            change. The weight of total variation is at most 0.25.
         tv_least: smallest weight of total variation in a fit of `paced_for` steps. In a longer fit the smallest weight
             is lower, see `in_steps`.
         tv_size: voxels per side of the random box on which total variation acts; None: a quarter of the grid's side, 32
             to 96.
-        tv_moves: True: total variation may move centres. In the published code (weight 0.05), this gradient is wrong:
-            it is too small by the square of the voxel size, so it has no effect. The correct gradient improves the
-            walnut by 0.2 dB (60 projections) and the battery by 0.4 dB (90 projections).
+        tv_moves: True: total variation may move the centres of Gaussians. In the published code (weight 0.05), the
+            gradient of total variation with respect to the centres is too small by the square of the voxel size, so it
+            has no effect. The correct gradient of total variation raises the PSNR of the walnut by 0.2 dB (60
+            projections) and that of the battery by 0.4 dB (90 projections).
         rates: learning rates at the first step: of centres (in units of half the width of the field), log scales,
             quaternions and raw densities.
-        pace: factor on all published rates. These are for 30 000 steps, and 1000 steps with them are far from
-            convergence. With a factor of 20, two projections per step and a low last rate, 1000 steps gain 1 to 4 dB.
-            With a factor of 26, the last rate is higher than with 20. Then 400 steps before the voxel refinement are
-            enough; with a factor of 20, the same volume needs 500 steps.
+        pace: factor on all published rates. The published rates are for 30 000 steps, and a fit of 1000 steps with them
+            is far from convergence. With `pace` 20, two projections per step and a low last rate, a fit of 1000 steps
+            gains 1 to 4 dB. With `pace` 26 and a higher last rate, 400 steps before the voxel refinement suffice for a
+            volume that needs 500 steps with `pace` 20.
         paced_for: largest number of steps for which `pace` is used unchanged, see `in_steps`.
         decay: last rate / first rate; in between, the logarithm of the rate falls linearly.
         policy: density control; None: the number of Gaussians stays the same.

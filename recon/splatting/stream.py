@@ -44,7 +44,7 @@ class StreamingFit:
         template: geometry of all future projections, with shift, roll and tilt; its angles are ignored.
         grid: grid of the snapshots; None: it matches the detector. The fit itself covers everything that the
             projections see.
-        gaussians: number of Gaussians at the first placement; None: derived from the detector (see `default_count`).
+        gaussians: number of Gaussians at the start of the fit; None: derived from the detector (see `default_count`).
         settings: settings of the fit; `joined_pixels` can only be used in a fit of a finished scan.
         first_views, first_span: the fit starts when this number of projections has arrived and they span this angle in
             radians (modulo π).
@@ -94,7 +94,8 @@ class StreamingFit:
 
     @property
     def started(self) -> bool:
-        """True if the fit has a model. There is no model as long as there are too few projections."""
+        """True if the fit has a model. The fit has no model until enough projections have arrived, see `first_views`
+        and `first_span`."""
         return isinstance(self._stage, Growing)
 
     def add_views(self, data: F32, angles: ArrayLike) -> None:
@@ -108,7 +109,7 @@ class StreamingFit:
                 values that are far too large. Nothing is added.
 
         Warns:
-            UserWarning: the angles so far look like degrees (given once).
+            UserWarning: the angles so far look like degrees. The warning comes only once.
         """
         check_arguments(StreamingFit.add_views, locals())
         theta, before = np.atleast_1d(np.asarray(angles, np.float64)), self._stage.views
@@ -121,7 +122,7 @@ class StreamingFit:
 
     def newest_view(self) -> tuple[F32, F32]:
         """Two arrays of line integrals [row, col]: the newest projection as it was measured, and the same projection
-        computed from the model. In pixels without data both are equal.
+        computed from the model. In pixels without data, both arrays contain the same value.
 
         Raises:
             ValueError: there is no model yet.
@@ -132,9 +133,10 @@ class StreamingFit:
         """Replace the line integrals [view, row, col] of all projections so far, in order, after a changed correction.
 
         If the new data differ by more than a fifth (norm) from the data with which the Gaussians were placed, the
-        Gaussians are placed again. If the new data differ by less, the model is kept. `kept` are the numbers, in order,
-        of the projections to which these data belong. If `kept` is given, the fit drops all other projections. The
-        learning rates then start again from their first values, because the model was fitted to bad projections.
+        Gaussians are placed again. If the new data differ by at most a fifth, the model is kept. `kept` are the
+        numbers, in order, of the projections to which these data belong. If `kept` is given, the fit drops all other
+        projections. After projections were dropped, the learning rates start again from their first values, because the
+        model was fitted to the dropped projections, too.
 
         Raises:
             ValueError: as for `add_views`, or there are no projections; nothing is changed.

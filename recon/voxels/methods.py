@@ -49,11 +49,12 @@ class FistaTv(HalfVoxels):
         tv_weight: threshold of one FISTA step in density units, so that μ = tv_weight x density unit x ||A||². If
             `tv_weight` is None, μ follows from held-out projections, or from the noise of the data, see
             `choose_weight`.
-        subsets: largest number of subsets into which the first iterations divide the projections. Each subset is one
-            step.
-        tv_steps: dual steps of total variation in each step. With 3, a cathode from 45 projections of 512 columns had
-            not converged after 60 iterations on whole voxels (22.8 dB). With 12 it has converged after 45 (23.3 dB),
-            and 180 projections need 19 iterations instead of 27. (tests/bench/ends.py)
+        subsets: largest number of subsets into which the first iterations divide the projections. One step of an
+            iteration uses one subset.
+        tv_steps: dual steps of total variation in each step. With 3 dual steps, a cathode from 45 projections of 512
+            columns had not converged after 60 iterations on whole voxels (22.8 dB). With 12 dual steps, the same
+            cathode has converged after 45 iterations (23.3 dB). From 180 projections, the volume converges in 19
+            iterations with 12 dual steps, and in 27 with 3 (tests/bench/ends.py).
         still: the volume has converged if four iterations together change it by less than this share of its norm; 0:
             all `iterations` are made.
         half_voxels: whether further iterations use voxels half as wide; None: with few projections, see
@@ -77,20 +78,20 @@ class FistaTv(HalfVoxels):
 
     @property
     def trial_sweeps(self) -> int:
-        """Iterations of the test reconstructions that choose the weight."""
+        """Number of iterations of the test reconstructions that choose the weight of total variation."""
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
 
     def refit(self, share: float) -> VoxelMethod:
-        """The method of the refits for error bars: `EarlyTv` with `share` times its own number of iterations, or
-        `share` times `iterations` if that is smaller.
+        """The method that computes the refits for error bars: `EarlyTv` with `share` times the default number of
+        iterations of `EarlyTv`, or with `share` times `iterations` of this method if `iterations` is smaller.
         """
         iterations = max(1, round(share * min(self.iterations, EarlyTv.iterations)))
         return EarlyTv(iterations, self.tv_weight, allow_negative=self.allow_negative)
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The residuals in the held-out projections, with the weight `tv_weight`, or with the best weight if
-        `tv_weight` is None. The volume has voxels of the full size, not half voxels: the projections are predicted with
-        voxels of the full size.
+        `tv_weight` is None. The test volume has voxels as wide as a pixel, not half as wide, because the trial computes
+        the held-out projections from voxels as wide as a pixel.
         """
         if self.tv_weight is not None or trial.weight is None:
             return trial.predicted(with_halves(self, False))
@@ -145,11 +146,11 @@ class OsSirtTv(VoxelMethod):
     """Ordered-subset SIRT with a proximal step of total variation and momentum after each iteration.
 
     The iterations end when the volume has converged. The weight of a ray is the inverse of the length of the ray in the
-    volume. Long rays usually pass through more material and carry fewer photons. Therefore the method suits scans with
-    very few photons (10 to 30 per pixel: up to 2 dB better than FISTA-TV). For a cone beam, the weight of total
-    variation is set from the noise. On a scan of a thorax, the PSNR of OS-SIRT-TV is 2.3 dB lower than that of
-    FISTA-TV, which chooses the weight with held-out projections. The momentum follows Kim, Ramani & Fessler (2015, IEEE
-    TMI 34, 167). Memory: 9 volumes and 3 times the projections.
+    volume. Long rays usually pass through more material and carry fewer photons. Because long rays have less weight,
+    OS-SIRT-TV suits scans with very few photons (10 to 30 per pixel: up to 2 dB better than FISTA-TV). For a cone beam,
+    the weight of total variation is set from the noise. On a scan of a thorax, the PSNR of OS-SIRT-TV is 2.3 dB lower
+    than that of FISTA-TV, which chooses the weight with held-out projections. The momentum follows Kim, Ramani &
+    Fessler (2015, IEEE TMI 34, 167). Memory: 9 volumes and 3 times the projections.
 
     Attributes:
         iterations: largest number of iterations over all projections.
@@ -175,7 +176,7 @@ class OsSirtTv(VoxelMethod):
 
     @property
     def trial_sweeps(self) -> int:
-        """Iterations of the test reconstructions that choose the weight."""
+        """Number of iterations of the test reconstructions that choose the weight of total variation."""
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
 
     @property
@@ -227,7 +228,8 @@ class PnpDct(VoxelMethod):
     FISTA-TV volume, unless a first volume is given. Memory: as for `FistaTv`.
 
     Attributes:
-        iterations: number of steps that fit the volume to the projections; five of them are made with each threshold.
+        iterations: number of steps that fit the volume to the projections. After five steps, a round of PnP-DCT ends,
+            and the next round has a lower threshold.
         patch_threshold: threshold of the last round, in density units. If `patch_threshold` is None, held-out
             projections choose the threshold, see `choose_patches`; if no projection can be held out, the threshold
             follows from the noise.
@@ -248,8 +250,8 @@ class PnpDct(VoxelMethod):
 
     @property
     def trial_sweeps(self) -> int:
-        """Number of iterations of all tests together: they choose the weight of total variation, make the first volume
-        of PnP-DCT, and try four thresholds.
+        """Number of iterations of all test reconstructions together. The test reconstructions choose the weight of
+        total variation, make the first volume of PnP-DCT, and try four thresholds.
         """
         return CHOICE_SWEEPS + USUAL_SWEEPS + TRIALS * self.trial_steps
 
@@ -260,7 +262,7 @@ class PnpDct(VoxelMethod):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """Empty, because no time limit can end the method: the number of steps is fixed."""
+        """No settings: a time limit cannot end PnP-DCT, because its number of steps is fixed."""
         return {}
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:

@@ -59,11 +59,11 @@ class _Rays(NamedTuple):
 class Projector:
     """Line integrals A through the voxels of `grid` along the rays of `geometry`, and their transpose Aᵀ.
 
-    Joseph's interpolation (P. M. Joseph 1982, IEEE TMI 1, 192): a ray is sampled once in each plane of voxels,
-    bilinearly. The volume is 0 outside the box. The result is in mm times the unit of the volume, float32.
+    The method is Joseph's (1982, IEEE TMI 1, 192): a ray is sampled once in each plane of voxels, by bilinear
+    interpolation. Outside `grid`, the volume is 0. Line integrals are float32, in mm times the unit of the volume.
 
     Attributes:
-        matched: True if projections are sharpened to the resolution of the measured ones.
+        matched: True if computed projections are sharpened to the resolution of measured projections.
         device: device on which loops with this projector compute, see `recon.voxels.devices`; the methods of the
             projector use the CPU.
         sharpened: [view, 2] variance in px² that the sharpening removes along columns and rows; None: no sharpening.
@@ -116,10 +116,11 @@ class Projector:
         """An upper limit of the factor by which sharpening raises the largest eigenvalue of AᵀWA. `weight` is W, the
         weight of each ray.
 
-        Sharpening by s raises the finest detail by the factor 1 + 2 s. Detail along the rotation axis is raised by all
-        projections. Detail across the axis is raised only by projections whose directions nearly agree: they differ by
-        less than a voxel at the edge of the field of view. The limit assumes that all projections contribute to the
-        largest eigenvector, unless a few rays weigh more than the others.
+        Sharpening that removes the variance s (px²) raises the finest detail by the factor 1 + 2 s. Detail along the
+        rotation axis is raised by all projections. Detail across the axis is raised only by projections whose
+        directions nearly agree: they differ by less than a voxel at the edge of the field of view. The upper limit
+        assumes that all projections contribute to the eigenvector of the largest eigenvalue, unless a few rays weigh
+        more than the others.
         """
         if self.sharpened is None:
             return 1.0

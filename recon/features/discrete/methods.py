@@ -55,12 +55,13 @@ class Discrete(HalfVoxels):
     """Discrete tomography: FISTA-TV, then min ½||A x - p||² + μ TV(x) + β Σ φ(x), x >= 0.
 
     φ pulls voxels to a few discrete grey levels, but not partial-volume voxels, which may lie between two levels; see
-    `recon.features.discrete.mixture`. Memory: as for `FistaTv`, plus 2 volumes.
+    `recon.features.discrete.mixture`. Memory: 10 volumes and 2 times the projections.
 
     Held-out projections choose the number of levels, their values, and the factor on the FISTA-TV weight μ. The result
-    is the FISTA-TV volume if discrete levels do not predict the held-out projections significantly better, if a weaker
-    pull predicts them better, or if there are too few projections to hold any out and no `levels` are given. If the
-    method starts from a given first volume, it uses total variation alone.
+    is the FISTA-TV volume if discrete levels do not predict the held-out projections significantly better, or if a
+    weaker pull to the levels predicts the held-out projections better. If the projections are too few to hold some out
+    and no `levels` are given, the result is the FISTA-TV volume, too. If the caller gives a volume to start from, the
+    method uses total variation alone.
 
     Attributes:
         iterations: largest number of iterations over all projections, not counting the FISTA-TV iterations before them.
@@ -89,8 +90,8 @@ class Discrete(HalfVoxels):
             raise ValueError(f"levels must be two or more values in ascending order, got {self.levels}")
 
     def refit(self, share: float) -> VoxelMethod:
-        """The method of the refits for error bars: `EarlyTv` with `share` times the number of iterations that was used
-        to calibrate error bars.
+        """The method that computes the refits for error bars: `EarlyTv` with `share` times the 16 iterations that were
+        used to calibrate error bars.
         """
         return EarlyTv(iterations=max(1, round(share * _REFIT_SWEEPS)), allow_negative=self.allow_negative)
 
@@ -101,8 +102,8 @@ class Discrete(HalfVoxels):
 
     @property
     def refused_sweeps(self) -> int:
-        """Iterations of the tests that reject discrete levels for the voxel refinement of a fit, usually at most.
-        PnP-DCT may be tried after these tests.
+        """Number of iterations of the tests that may reject discrete levels for the voxel refinement of a Gaussian fit;
+        usually there are not more. After a rejection, PnP-DCT may be tried.
         """
         return _REJECTED * self.usual_sweeps
 
@@ -110,8 +111,9 @@ class Discrete(HalfVoxels):
     def probabilities(cls, volume: Volume, settings: Mapping[str, Any]) -> F32 | None:
         """[material, z, y, x] probability that a voxel belongs to a material, in ascending order of the levels.
 
-        The probabilities of a voxel add up to less than 1. The rest is the probability that the voxel is a
-        partial-volume voxel. The result is None if the volume with these settings was not pulled to discrete levels.
+        The probabilities of a voxel add up to less than 1; the difference from 1 is the probability that the voxel is a
+        partial-volume voxel. The result is None if `settings` contains no discrete levels, because the volume was not
+        pulled to any.
         """
         fields: list[Any] = [settings.get(name + _OF, ()) for name in MaterialPrior._fields]
         if not len(fields[0]):
@@ -121,7 +123,8 @@ class Discrete(HalfVoxels):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """Empty, because no time limit can end the method: it needs all iterations of its tests to find levels."""
+        """No settings: a time limit cannot end discrete tomography, because it needs all iterations of its tests to
+        find levels."""
         return {}
 
     def toy(self) -> Self:
@@ -193,9 +196,9 @@ class Discrete(HalfVoxels):
         self, problem: VoxelProblem, x: F32, weight: TvWeight, materials: MaterialPrior, done: int,
         to_the_end: bool = True,
     ) -> F32:  # fmt: skip
-        """Continue from the volume x [y, x, z], with a pull to the grey levels, and return the new volume [y, x, z]. At
-        most `iterations` iterations are made. `done` is the number of iterations that were made before, for the
-        progress. `to_the_end` is explained in `Subsets.of`.
+        """Continue from the volume x [y, x, z], with a pull to the grey levels, and return the new volume [y, x, z].
+        The function makes at most `iterations` iterations. `done` is the number of iterations that the method made
+        before; the reported progress counts on from this number. `to_the_end` is explained in `Subsets.of`.
         """
         pull, further = pull_to(materials, problem, x), replace(problem, go_on=problem.go_on.after(done))
         count = subsets_of(problem.projector.geometry, SUBSETS if to_the_end else MANY_SUBSETS, to_the_end)

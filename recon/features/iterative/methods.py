@@ -68,12 +68,12 @@ class Sart(VoxelMethod):
 
 @dataclass(frozen=True)
 class Cgls(VoxelMethod):
-    """Conjugate gradients on the normal equations (CGLS; Hestenes & Stiefel 1952). The only regularisation is to stop
-    early.
+    """Conjugate gradients on the normal equations (CGLS; Hestenes & Stiefel 1952). The only regularisation of CGLS is
+    to stop early.
 
-    Negative values are clipped at the end. In float32, rounding makes the directions lose conjugacy after about eight
-    iterations. After that, the method is about one iteration behind exact arithmetic. Memory: 3 volumes and 3 times the
-    projections.
+    After the last iteration, negative voxels are set to 0, unless `allow_negative` is True. In float32, rounding makes
+    the search directions lose conjugacy after about eight iterations. From then on, CGLS in float32 is about one
+    iteration behind CGLS in exact arithmetic. Memory: 3 volumes and 3 times the projections.
     """
 
     name: ClassVar[str] = "cgls"
@@ -85,7 +85,7 @@ class Cgls(VoxelMethod):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """Empty, because a time limit cannot end this method: more iterations do not improve its volume."""
+        """No settings: CGLS cannot use a time limit, because more iterations do not improve its volume."""
         return {}
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
@@ -121,17 +121,18 @@ class Cgls(VoxelMethod):
 class AsdPocs(VoxelMethod):
     """Adaptive steepest descent of TV, alternating with SART (Sidky & Pan 2008, PMB 53, 4777).
 
-    Each iteration makes one SART iteration, then `tv_steps` steps down the gradient of TV. Each step is `alpha` times
-    as long as the change of the first SART iteration. If the steps undo more than `ratio` of the SART iteration, and
-    the residual is still above `goal`, the length of the steps is multiplied by `alpha_decay`. Memory: 5 volumes and 3
-    times the projections.
+    One iteration of ASD-POCS is one SART iteration, then `tv_steps` steps down the gradient of TV. At first, each TV
+    step is `alpha` times as long as the change of the volume in the first SART iteration. If the TV steps of an
+    iteration change the volume by more than `ratio` times the change of its SART iteration, and the residual is still
+    above `goal`, the length of the next TV steps is multiplied by `alpha_decay`. Memory: 5 volumes and 3 times the
+    projections.
 
     Attributes:
         goal: relative residual ||A x - p|| / ||p|| at which the TV steps are no longer shortened. If `goal` is None, it
             is 0.15 times the residual of filtered back-projection (FBP or FDK). FDK cannot reconstruct a short cone
             scan. For a short cone scan the goal is 0.15 times the residual after one iteration of ordered-subset SIRT.
-            This residual is similar to the residual of FDK. (A box in a box, 20 to 180 projections, 0 and 2 % noise:
-            0.085 to 0.12 for SIRT, 0.075 to 0.11 for FDK.)
+            The residual after one iteration of ordered-subset SIRT is similar to the residual of FDK: with 20 to 180
+            projections of a box in a box, and 0 or 2 % noise, it is 0.085 to 0.12 for SIRT and 0.075 to 0.11 for FDK.
     """
 
     name: ClassVar[str] = "asd-pocs"

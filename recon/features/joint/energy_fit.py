@@ -49,8 +49,8 @@ class EnergyViews:
     """Projections of one sample at several energies. A projection shows each material with its attenuation at the
     energy of the projection.
 
-    A series in time has the same mathematical form: the moments replace the energies, and the volumes replace the
-    materials.
+    A series of volumes in time has the same mathematical form: points in time replace the energies, and the volumes
+    replace the materials.
 
     Attributes:
         projections: line integrals, float32 [view, row, col], finite.
@@ -88,7 +88,7 @@ class EnergyViews:
         refuse_alike(self.cross_sections[np.unique(self.energy)])
 
     def select(self, views: NDArray[np.intp], rows: slice) -> EnergyViews:
-        """The same data with only these projections, and only these detector rows."""
+        """The data of the projections `views` and of the detector rows `rows` only."""
         first, stop, _ = rows.indices(self.projections.shape[1])
         weight = None if self.weight is None else self.weight[views, rows]
         geometry = self.geometry.select(views).rows(first, stop)
@@ -98,7 +98,7 @@ class EnergyViews:
         """Divide the projections into n parts, so that each part has projections of all energies and directions. Return
         the number of the part, 0 to n - 1, for each projection.
 
-        If there are more energies than projections in a part, neighbouring energies count as one.
+        If there are more energies than projections in a part, neighbouring energies are treated as one energy.
         """
         views, energies = self.geometry.n_views, len(self.cross_sections)
         groups = min(energies, max(n, views // n))

@@ -185,14 +185,14 @@ def register_energies(
     """Align the scans at all energies: correct for the position of the sample and for the optics (parallel beam).
 
     The energy with the most projections is the reference. The volume at the reference energy, scaled by the mean
-    absorption at another energy, predicts the projections at that energy. Six parameters explain the differences (see
-    `recon.voxels.displacement`): the sample is shifted along x, y and z and rotated about the axis; the image is
-    shifted along the rows and magnified. The edges in the projections determine the parameters, so a material whose
-    absorption differs between two energies does no harm.
+    absorption at another energy, predicts the projections at that energy. Six parameters describe how measured
+    projections differ from predicted ones (see `recon.voxels.displacement`): the sample is shifted along x, y and z and
+    rotated about the axis; the image is shifted along the rows and magnified. The edges in the projections determine
+    the parameters, so a material whose absorption differs between two energies does no harm.
 
     Returns:
-        The projections (interpolated if their magnification differs), and the displacement at each energy. The
-        displacement is 0 if a displacement does not predict held-out projections better.
+        The projections (interpolated if their magnification differs), and the displacement at each energy. All
+        displacements are 0 if the displacements found do not improve the prediction of held-out projections.
 
     Raises:
         ValueError: the beam is a cone: a shift of the sample then changes the directions of the rays through the

@@ -35,7 +35,7 @@ class TimeSeries(Series):
         sweeps: number of iterations of the fit.
         weight: weight of total variation, `tv_weight` of `fit_series`; None: held-out projections decide.
 
-    Raises: ValueError: `volumes` is below 2, or another value is not allowed.
+    Raises: ValueError: `volumes` is below 2, or `sweeps` or `weight` has a value that is not allowed.
     """
 
     name: ClassVar[str] = "series"

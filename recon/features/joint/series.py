@@ -61,7 +61,7 @@ class TimedViews:
         weight: weight of each ray [view, row, col]; None: 1.
 
     Raises:
-        ValueError: there is not one time per projection, a time is not finite, or all are equal.
+        ValueError: there is not one time per projection, a time is not finite, or all times are equal.
     """
 
     projections: F32
@@ -92,7 +92,8 @@ class TimedVolumes:
             applied. `at` gives the displaced volume.
         grid: grid of each volume.
         residual: norm of the residual of the projections, divided by the norm of the projections.
-        motion: for each voxel, the displacement to the place from which the voxel takes its value; None: nothing moves.
+        motion: displacement field of the sample in time; a voxel of the displaced volume gets the value at its own
+            place plus the displacement. None: nothing moves.
         unseen_residuals: residuals of coarse volumes in held-out projections, without motion and with motion; None if
             held-out projections did not decide about motion.
         smooth: smoothness of the factors (module `proportions`), if each volume is the mean volume multiplied by smooth
@@ -139,25 +140,26 @@ def fit_series(
 
         min ½ Σ_v |A_v W(t_v) Σ_k h_k(t_v) x_k - p_v|² + Σ_j μ_j TV(z_j),    x_k >= 0
 
-    h_k are hat functions, so the volume is linear in time between knots. W displaces the volume, smoothly in space and
-    time, and is the identity in the middle of the scan (module `motion`). Mathematically this is the problem of
-    `fit_materials`: knots replace the materials, and hat functions replace the cross sections. z_j are the orthonormal
-    components of all volumes x_k; the first one is their common part. If nothing moves, the function also tries the
-    mean volume times smooth factors. Volumes with factors are returned if they predict held-out projections better.
-    Smooth factors suit a sample of particles in which each particle takes up or loses material at its own time. Steps,
-    memory, `go_on` and `stop` are as in `fit_materials`. There are four tests: of the weights, of whether the sample
-    moves, of the motion, and of the factors. During each test, `go_on` gets a countdown that ends at 0. After the
-    iterations, `go_on` gets a countdown of the steps that fit the factors. If you end the fit of the factors early, the
-    result is the volumes without factors.
+    h_k are hat functions, so the volume is linear in time between knots. The operator W displaces the volume, smoothly
+    in space and time, and is the identity in the middle of the scan (module `motion`). Mathematically this is the
+    problem of `fit_materials`: knots replace the materials, and hat functions replace the cross sections. z_j are the
+    orthonormal components of all volumes x_k; the first one is their common part. If nothing moves, `fit_series` also
+    tries volumes that are the mean volume multiplied by factors, which are smooth in space. `fit_series` returns
+    volumes with smooth factors if these volumes predict held-out projections better than separate volumes. Smooth
+    factors suit a sample of particles in which each particle takes up or loses material at its own time. Steps, memory,
+    `go_on` and `stop` of `fit_series` are as in `fit_materials`. Up to four tests come before the fit: they choose the
+    weights, decide whether the sample moves, estimate the motion, and choose the smoothness of the factors. During each
+    test, `go_on` gets a countdown that ends at 0. After the last iteration of the fit, `go_on` gets a countdown of the
+    steps that fit the factors. If `go_on` ends the fit of the factors early, the result is the volumes without factors.
 
     Args:
         knots: number of volumes, 2 or more.
         motion: True: also estimate the motion; None: use the motion only if it predicts held-out projections better.
-            Motion helps for a sample that settles. If only the densities of the sample change, the estimate shows
-            motion that does not exist.
-        tv_weight: μ of all components. The scale is that of one volume: for a sample that does not change, the value
-            has the same effect as the same weight for one volume from all projections. If `tv_weight` is None, the
-            weight that predicts held-out projections best is used.
+            Use motion for a sample that settles. If only the densities of the sample change, `motion=True` finds motion
+            that does not exist.
+        tv_weight: μ of all components. For a sample that does not change, `tv_weight` has the same effect as the same
+            weight for a single volume from all projections. If `tv_weight` is None, the weight that predicts held-out
+            projections best is used.
 
     Raises:
         ValueError: a volume has fewer than twelve projections, or fewer than six projections are nearer in time to this

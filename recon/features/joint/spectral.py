@@ -53,11 +53,11 @@ class Materials:
 
     def share(self, of: int, others: Sequence[int], least: float) -> F32:
         """The density of a material, divided by the sum of the densities of this material and the others, [z, y, x], 0
-        to 1. An example is the state of charge.
+        to 1. For example, the share of a charged material is the state of charge of a battery electrode.
 
         Args:
-            least: smallest sum of all densities of a voxel for which a share is computed. Voxels with a smaller sum
-                get NaN.
+            least: smallest sum of the densities of this material and the others, for which a share is computed. Voxels
+                with a smaller sum of densities get NaN.
         """
         part = self.densities[of]
         total = part + self.densities[list(others)].sum(0)
@@ -79,13 +79,12 @@ def fit_materials(
 
         min over z of ½ Σ_v |A_v Σ_k U[e(v), k] z_k - p_v|² + Σ_k μ_k TV(z_k),    densities >= 0
 
-    U S Vᵀ is the singular value decomposition of the cross sections (each energy weighted by its number of
-    projections). The densities are V S⁻¹ z. U has orthonormal columns. Therefore all components z_k have the same
-    noise, and the fit is as well conditioned as a fit at a single energy. An iteration takes as long as it would for
-    the same number of projections at a single energy. Each iteration makes the steps of `ordered_fista`. After each
-    step, densities below 0 are set to 0. (Long & Fessler 2014, IEEE TMI 33, 1614, also fit materials to spectra in one
-    step.)
-    Memory: seven volumes per material, three times the projections.
+    The singular value decomposition of the cross sections is U S Vᵀ (each energy weighted by its number of
+    projections). The densities of the materials are V S⁻¹ z. The columns of U are orthonormal, so all components z_k
+    have the same noise, and the fit is as well conditioned as a fit at a single energy. An iteration takes as long as
+    it would for the same number of projections at a single energy. Each iteration makes the steps of `ordered_fista`.
+    After each step, densities below 0 are set to 0. Long & Fessler (2014, IEEE TMI 33, 1614) also fit the densities of
+    materials to spectral projections in one step. Memory: seven volumes per material, three times the projections.
 
     Args:
         grid: grid of the volumes; None: the grid of the geometry.
