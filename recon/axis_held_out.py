@@ -160,7 +160,7 @@ class _Residuals:
             matter = _norm(measured)
             if matter == 0:
                 raise AxisError(
-                    "give the axis: it cannot be determined, because the held-out projections show no material"
+                    "give the rotation axis: it cannot be found, because the held-out projections show no material"
                 )
             self.found[axis_col] = _norm(measured - images * lit) / matter
             self.ask(axis_col)
@@ -178,8 +178,8 @@ def _coarse_optimum(residual: _Residuals, geometry: Geometry) -> tuple[float, fl
         best = min((best, best - step, best + step), key=residual)
     if abs(best - start) > _WIDEST * cols:
         raise AxisError(
-            f"give the axis: none was found within {_WIDEST * cols:.0f} columns of column {start:.1f}. The held-out "
-            f"projections agree best with column {best:.1f}, at the edge of the search"
+            f"give the axis: no rotation axis was found within {_WIDEST * cols:.0f} columns of column {start:.1f}. "
+            f"The held-out projections agree best with column {best:.1f}, at the edge of the search"
         )
     return best, typical
 

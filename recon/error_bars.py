@@ -132,7 +132,9 @@ def method_on_voxels(method: Method, decided: Mapping[str, Sequence[Any]]) -> Me
     if not isinstance(method, Fit):
         return method
     if "weight" not in decided:
-        raise ValueError(f"error bars of {method.name} need its voxel refinement, and this run had none")
+        raise ValueError(
+            f"error bars of {method.name} need a run with voxel refinement, but this run had no voxel refinement"
+        )
     smooth, patches = (one(allow_negative=method.allow_negative) for one in (FistaTv, PnpDct))
     (levels, *_), (_, by_patches) = decided.get("materials", [[()]])[-1], decided.get("strength", [(0.0, 0)])[-1]
     return pull_methods(allow_negative=method.allow_negative)[0] if levels else patches if by_patches else smooth

@@ -53,7 +53,7 @@ def _entry(name: str, method: type[Method]) -> MethodEntry:
     if not issubclass(method, Method):
         raise ValueError("the class must derive from one of the classes in recon.base.method_kinds")
     if method.name != name:
-        raise ValueError(f"the `name` of its class is {method.name!r}; expected the name of the entry point")
+        raise ValueError(f"the `name` of the method's class is {method.name!r}; expected the name of the entry point")
     entry = MethodEntry(method.__module__, method.__name__, hasattr(method, "stream"))
     if getattr(import_module(entry.module), entry.cls, None) is not method:
         raise ValueError(

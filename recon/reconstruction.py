@@ -137,10 +137,10 @@ def _warn_of_unseen_cone(method: Method, geometry: Geometry) -> None:
     lean = geometry.unseen_cone
     if lean and any(each.trial_sweeps for each in method.alternatives):
         warnings.warn(
-            "give a weight of total variation: fista-tv with tv_weight 0.001, or 0.002 for a plate with sharp edges. "
-            f"In all projections the rotation axis is tilted along the beam, by {math.degrees(lean):.3g} degrees or "
-            "more. No projection then shows structure along the axis, such as the faces of a plate. Held-out "
-            "projections do not show this structure either, so they choose a weight that is too small",
+            "give a weight of total variation: fista-tv with tv_weight 0.001, or 0.002 for a plate with sharp "
+            f"edges. In all projections the rotation axis is tilted along the beam, by {math.degrees(lean):.3g} "
+            "degrees or more, so no projection shows structure along the axis, such as the faces of a plate. "
+            "Held-out projections do not show such structure either, so they would choose a weight that is too small",
             stacklevel=3,
         )
 
@@ -153,10 +153,10 @@ def _warn_of_missing_wedge(method: Method, geometry: Geometry) -> None:
     missing = sum(wedge.size for wedge in unseen)
     low, high = density_errors(min(missing, math.pi * (1 - 1e-3)))
     warnings.warn(
-        f"for densities use an iterative method such as fista-tv, because in {math.degrees(missing):.3g} of 180 "
-        f"degrees there is no projection. {method.label} multiplies densities by "
-        f"{math.pi / (math.pi - missing):.4g}, which is right for round bodies. A body twice as long as wide is off by "
-        f"{100 * low:+.0f} to {100 * high:+.0f} %",
+        f"for correct densities use an iterative method such as fista-tv, because {math.degrees(missing):.3g} of "
+        f"180 degrees have no projection. {method.label} multiplies densities by "
+        f"{math.pi / (math.pi - missing):.4g}, which is right only for round bodies. The density of a body twice as "
+        f"long as wide is wrong by {100 * low:+.0f} to {100 * high:+.0f} %",
         stacklevel=3,
     )
 
@@ -169,10 +169,11 @@ def _warn_of_half_acquisition(views: Views) -> None:
     left, right = geometry.axis_col + 0.5, geometry.detector_shape[1] - 0.5 - geometry.axis_col
     if ("left" if left < right else "right") in reach_of(views).beyond:
         warnings.warn(
-            "take projections over 360 degrees without a gap, or distrust the densities: the sample reaches beyond the "
-            f"edge of the detector that is {min(left, right):.0f} columns from the rotation axis, and only a full "
-            "circle shows all rays that are farther from the axis. Without it, densities were up to a third too low "
-            "with FBP and an eighth with iterative methods (docs/numerics.md)",
+            "take projections over 360 degrees without a gap, or distrust the densities: the sample reaches beyond "
+            f"the edge of the detector that is {min(left, right):.0f} columns from the rotation axis, and only a "
+            "full circle shows all rays that are farther from the axis. Without a full circle, densities in our "
+            "tests were too low: by up to a third with FBP, by up to an eighth with iterative methods "
+            "(docs/numerics.md)",
             stacklevel=3,
         )
 
@@ -218,7 +219,10 @@ def _views(projections: ArrayLike | Tensor | Counts | Views, geometry: Geometry 
             "use.sample_radius": use.sample_radius is not None,
         }
         if twice := [name for name, is_given in given.items() if is_given]:
-            raise ValueError(f"leave out {' and '.join(twice)}, because the projections are given as Views")
+            raise ValueError(
+                f"leave out {' and '.join(twice)}, because the projections are given as Views, which contain this "
+                "information"
+            )
         _refuse_geometry(projections.geometry)
         weights = None if projections.weights is None else projections.weights[...]
         return replace(projections, data=_line_integrals(projections.data, projections.geometry), weights=weights)
@@ -247,8 +251,8 @@ def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.fl
     some = some[np.isfinite(some)]
     if some.size and (most := float(np.quantile(some, 0.9))) > _LARGEST:
         raise ValueError(
-            "divide the line integrals by a constant; the volume is then divided by the same constant. One in ten of "
-            f"them is above {most:.3g}. At most {_LARGEST:g} is possible, because the sums of squares of larger "
-            "values exceed the range of float32"
+            "divide the line integrals by a constant; the volume is then divided by the same constant. One in ten "
+            f"line integrals is above {most:.3g}. Line integrals up to {_LARGEST:g} are possible, because the sums "
+            "of squares of larger values exceed the range of float32"
         )
     return data

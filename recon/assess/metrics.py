@@ -61,7 +61,9 @@ def nrmse(truth: Array, volume: Array) -> float:
 def _data_range(truth: Array, data_range: float | None) -> float:
     span = float(truth.max() - truth.min()) if data_range is None else data_range
     if not span > 0:
-        raise ValueError(f"the data range must be positive, got {span}; state it if the ground truth is constant")
+        raise ValueError(
+            f"the data range must be positive, got {span}; state the data range if the ground truth is constant"
+        )
     return span
 
 

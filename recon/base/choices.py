@@ -34,5 +34,5 @@ def refuse_unknown_device(device: str) -> None:
     if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
         raise ValueError(
             f"device must be 'cpu' or 'cuda', got {device!r}. 'cuda' is the current CUDA device. To choose another "
-            "one, set CUDA_VISIBLE_DEVICES before Python starts"
+            "CUDA device, set CUDA_VISIBLE_DEVICES before Python starts"
         )

@@ -91,10 +91,10 @@ def _of_unknown(path: KeyPath, name: str, data: Any, schema: Schema, former: Map
     others = [key for key in _value(data, path[:-1]) if key not in keys]
     if advice and len(others) > _MANY:
         return (
-            f"{name.rpartition('.')[0]}: remove {', '.join(others)}, because this kind does not have these keys. "
-            f"{advice}"
+            f"{name.rpartition('.')[0]}: remove the keys {', '.join(others)}, because they do not belong to the "
+            f"stated kind. {advice}"
         )
-    return f"{name} is not a known key{did_you_mean(path[-1], keys)}; legal keys there: {', '.join(keys)}"
+    return f"{name} is not a known key{did_you_mean(path[-1], keys)}; legal keys in this section: {', '.join(keys)}"
 
 
 def _of_value(path: KeyPath, name: str, data: Any, schema: Schema, missing: bool) -> str:

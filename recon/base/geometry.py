@@ -99,7 +99,7 @@ class Geometry:
             )
         if not math.isfinite(self.skew) or (self.skew and not (self.is_straight and not self.is_cone)):
             raise ValueError(
-                "skew must be finite. It must be 0 for a cone beam, and if a projection is rolled or tilted. Got "
+                "skew must be finite, and 0 for a cone beam or if a projection is rolled or tilted; got "
                 f"{self.skew:.3g} rad per row"
             )
 

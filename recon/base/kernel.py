@@ -136,5 +136,8 @@ class RayModel:
         if self.rectified:
             return 0.0
         if geometry.width:
-            raise ValueError(f"rays with a width ({geometry.width}) need the corrected factor: leave rectified=True")
+            raise ValueError(
+                "leave rectified=True: without the corrected footprints, a Gaussian does not keep its mass if rays "
+                f"have a width ({geometry.width})"
+            )
         return geometry.detector_shape[1] * geometry.sample_pitch / 2

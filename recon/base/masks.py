@@ -109,7 +109,7 @@ def masked(
         within = "finite" if math.isinf(largest) else f"finite, within ±{largest:.3g}"
         raise ValueError(
             f"leave out {empty.size} of {len(projections)} projections (numbers {empty[:8].tolist()} ...): they "
-            f"contain no usable value ({within}, with a weight above 0)"
+            f"contain no usable value. A usable value is {within}, and has a weight above 0"
         )
     filled = np.array(projections, np.float32)
     known = np.ones(projections.shape, np.float32) if weight is None else np.array(weight, np.float32)

@@ -186,7 +186,7 @@ def _first_peak(curve: NDArray[np.float64], height: float, prominence: float) ->
         ]
         if top - max(valleys) >= prominence:
             return int(first + last) // 2
-    raise ValueError("the curve has no peak of this height and prominence")
+    raise ValueError("the curve has no peak that is high enough and stands out enough from its surroundings")
 
 
 def _long_axes(images: F32) -> list[int]:

@@ -53,7 +53,7 @@ def add_on_missing(name: str) -> str:
     """The end of a sentence, without a full stop, that says why an add-on of `ADD_ONS` is missing and what to do."""
     for point in entry_points_announced():
         if point.name == name:
-            why = "is installed, but could not be used: read the warning above, which gives the reason"
+            why = "is installed, but could not be used: read the earlier warning, which gives the reason"
             try:
                 point.load()
             except (Exception, SystemExit) as error:
@@ -203,8 +203,8 @@ def plugins(
             package = f" of the package {point.dist.name}" if point.dist is not None else ""
             reason = f"{point.name!r}{package} ({point.value}) was left out: {type(error).__name__}: {error}"
             warnings.warn(
-                f"The {kind.replace('_', ' ')} {_one_line(reason)}. Everything else works without it. To use it, "
-                "repair that package; otherwise uninstall it.",
+                f"The {kind.replace('_', ' ')} {_one_line(reason)}. Everything else works without this plug-in. "
+                "Repair the package of the plug-in, or uninstall it.",
                 stacklevel=2,
             )
     return found

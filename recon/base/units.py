@@ -57,8 +57,8 @@ def warn_of_degrees(angles: NDArray[np.floating], ended: bool = True) -> None:
     """Give a UserWarning if angles look like degrees. The warning names the line that called the calling function."""
     if look_like_degrees(angles, ended):
         warnings.warn(
-            f"angles must be in radians. These reach {np.abs(angles).max():.5g} and look like degrees: give "
-            "np.deg2rad(angles)",
+            f"angles must be in radians. The given angles reach {np.abs(angles).max():.5g} and look like degrees: "
+            "give np.deg2rad(angles)",
             stacklevel=3,
         )
 
@@ -125,14 +125,14 @@ def warn_of_other_quantity(projections: NDArray[np.floating], stacklevel: int = 
     """
     if look_like_counts(projections):
         warnings.warn(
-            "projections must be line integrals. These look like counts (median "
-            f"{np.nanmedian(projections[:1]):.4g}). Convert them with -log((counts - dark) / (flat - dark)), see "
+            "projections must be line integrals. The given projections look like counts (median "
+            f"{np.nanmedian(projections[:1]):.4g}). Convert counts with -log((counts - dark) / (flat - dark)), see "
             "recon.correct, or give recon.Counts",
             stacklevel=stacklevel,
         )
     elif look_like_transmission(projections):
         warnings.warn(
-            "projections must be line integrals. These look like transmission: they are about 1 at the left and "
-            "right edges and lower in the sample. Give -np.log(transmission)",
+            "projections must be line integrals. The given projections look like transmission, because their values "
+            "are about 1 at the left and right edges and lower in the sample. Give -np.log(transmission)",
             stacklevel=stacklevel,
         )

@@ -79,8 +79,9 @@ def geometry_of_vectors(vectors: ArrayLike, detector_shape: tuple[int, int], *, 
     sod = float(np.median(-_dot(first, beam)))
     if not 0 < sod <= sdd * (1 + _CLEAN):
         raise ValueError(
-            f"the middle of the volume must lie between the sources and their detectors. It is {sod:.6g} mm from the "
-            f"sources, and the detectors are at {sdd:.6g} mm. Measure all vectors from a point in the sample"
+            "the middle of the volume must lie between the sources and the detectors. The distance from the sources "
+            f"is {sod:.6g} mm to the middle of the volume, and {sdd:.6g} mm to the detectors. Measure all vectors "
+            "from a point in the sample"
         )
     centres = first + sod * beam
     centres[np.abs(centres).max(axis=1) < _CLEAN * sod] = 0

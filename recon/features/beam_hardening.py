@@ -41,7 +41,9 @@ class Curve:
     def __post_init__(self) -> None:
         rising = (np.diff(self.measured) > 0).all() and (np.diff(self.corrected) > 0).all()
         if self.measured.shape != self.corrected.shape or self.measured.size < 2 or not rising:
-            raise ValueError("a curve needs at least two nodes, with ascending measured and corrected values")
+            raise ValueError(
+                "a beam-hardening curve needs at least two nodes, with ascending measured and corrected values"
+            )
 
     def linearise(self, views: F32, weights: F32 | None = None) -> None:
         """Replace line integrals of any shape, and their inverse variances, by corrected ones, in place."""
@@ -88,7 +90,9 @@ def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tup
     few = slice(None, None, max(1, p.size // _MOST_RAYS))
     p, length = p[few], length[few]
     if (inside := np.count_nonzero(length)) < _FEWEST_RAYS:
-        raise NoCurveError(f"too few rays go through the material: {inside}, and {_FEWEST_RAYS} are needed")
+        raise NoCurveError(
+            f"too few rays go through the material: {inside} rays, but at least {_FEWEST_RAYS} are needed"
+        )
     slope = float(p @ length / (length @ length))
 
     def curve_points(soft: float, hard: float, share: float) -> F64:

@@ -57,9 +57,9 @@ class Paganin:
 
     def __post_init__(self) -> None:
         if not 0 <= self.length < math.inf:
-            raise ValueError(f"length must be finite pixels, 0 or more, got {self.length}")
+            raise ValueError(f"the filter length must be a finite number of pixels, 0 or more; got {self.length}")
         if self.unsharp is not None and not (self.unsharp[0] > 0 and 0 <= self.unsharp[1] < math.inf):
-            raise ValueError(f"unsharp must be a sigma > 0 and a weight >= 0, got {self.unsharp}")
+            raise ValueError(f"unsharp must be a sigma in pixels > 0 and a weight >= 0, got {self.unsharp}")
 
     @property
     def reach(self) -> int:

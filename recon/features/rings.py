@@ -226,12 +226,13 @@ def rings_seen(views: F32, angles: NDArray[np.float64], axis_col: float) -> str:
     steady = steadiness(views[np.ix_(np.argsort(angles, kind="stable"), _some_rows(views))], axis_col)
     if steady is None or not steady.stripes or steady.odd < _FAINTEST * float(np.abs(views).max()):
         return ""
+    difference, noises = steady.odd, steady.score
     return (
-        f"Expect ring artefacts: pixel sensitivities differ by {steady.odd:.2g} in line integral, {steady.score:.1f} "
-        "times the noise of a column. Nothing was removed. To remove the rings, use --rings auto, which filters the "
-        "projections. If the scan is finished, you can use --calibrate gains instead, which measures the sensitivities "
-        "with the volume. If the sample has layers around the rotation axis, compare the two volumes, with rings "
-        "removed and as they are now, because layers look like rings."
+        f"Expect ring artefacts: pixel sensitivities differ by {difference:.2g} in line integral, {noises:.1f} times "
+        "the noise of a column. No stripes were removed from the projections. To remove the rings, use --rings auto, "
+        "which filters the projections. If the scan is finished, you can use --calibrate gains instead, which measures "
+        "the sensitivities with the volume. If the sample has layers around the rotation axis, compare the volumes "
+        "with and without removal of rings, because layers look like rings."
     )
 
 

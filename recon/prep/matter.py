@@ -152,7 +152,7 @@ def tube_spectrum(kv: float, filters: Mapping[str, float]) -> tuple[F64, F64]:
             filters.
     """
     if not 5 <= kv <= 800:
-        raise ValueError(f"kv must be 5 to 800, got {kv}")
+        raise ValueError(f"the tube voltage must be 5 to 800 kV, got {kv} kV")
     x, w = _gauss_rule()
     energies = _SOFTEST_KEV + (kv - _SOFTEST_KEV) * (x + 1) / 2
     depth = np.zeros(_NODES)

@@ -26,7 +26,7 @@ _EDGE, _OF_DEEPEST = 6.0, 0.02
 _FEWEST = 6  # least number of edge positions
 # smallest significance in standard errors, computed from the agreement between positions, and from the noise of the air
 _AGREE, _ERRORS = 2.0, 6.0
-SEARCH = "`recon --phase auto` searches for a filter that removes them."
+SEARCH = "To remove phase fringes, use `recon --phase auto`, which searches for a phase filter."
 LEAST_SHARE = 0.01
 """An overshoot below this share of the step at the edge does not count. After this value was set, 227 simulated scans
 without fringes were examined once: their overshoot is at most 1.9 standard errors."""

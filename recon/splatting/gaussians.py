@@ -173,7 +173,11 @@ def _tensor(values: NDArray[np.floating]) -> Tensor:
     try:
         tensor: Tensor = torch.from_numpy(np.ascontiguousarray(values, np.float32).copy())
     except RuntimeError as error:  # "Numpy is not available"
-        raise LibraryError(f"this torch was built for another version of numpy: {error}", name="torch") from error
+        raise LibraryError(
+            "install torch and numpy versions that fit together: the installed torch was built for another version "
+            f"of numpy ({error})",
+            name="torch",
+        ) from error
     return tensor
 
 

@@ -91,7 +91,9 @@ class _FitViews:
         kept_back = views.unseen
         blank = views.held_out[~views.data[views.held_out].any(axis=(1, 2))]
         if blank.size:
-            raise ValueError(f"held_out: projections {blank.tolist()} are zero everywhere; hold out others")
+            raise ValueError(
+                f"hold out other projections: the held-out projections {blank.tolist()} are zero everywhere"
+            )
         measured, start = views.seen, method.gaussians
         geometry = _of_steps(measured.geometry, problem.device)
         pixel_grid = Grid.for_fit(_of_steps(views.geometry, problem.device), problem.grid)

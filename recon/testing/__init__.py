@@ -55,7 +55,10 @@ class MethodConformance:
 
     @pytest.fixture
     def method(self) -> Method:
-        pytest.fail("Define the fixture `method` in your subclass: the method, with settings that take seconds.")
+        pytest.fail(
+            "Define the fixture `method` in your subclass: it must return the method to test, with settings with "
+            "which a run takes only seconds."
+        )
 
     def test_it_is_an_immutable_value_that_says_who_it_is(self, method: Method) -> None:
         assert is_dataclass(method) and method.__dataclass_params__.frozen

@@ -186,10 +186,9 @@ class TrialChoice(NamedTuple):
         )
         margin = f"{self.least_gain:.0%} and by more than " if self.least_gain else "more than "
         return (
-            f". The residual of {best} is {improvement:.2%} smaller than that of {simple} "
-            f"(standard error {error:.2%}). "
-            f"{simple} was chosen, because it is simpler: the residual of a costlier method must be smaller by "
-            f"{margin}one standard error"
+            f". The residual of {best} is {improvement:.2%} smaller than the residual of {simple} (standard error "
+            f"{error:.2%}). {simple} was chosen, because it is simpler: a costlier method is chosen only if its "
+            f"residual is smaller by {margin}one standard error"
         )
 
 

@@ -148,8 +148,8 @@ def _by_slabs(
         )
     if (reach := float(np.hypot(*np.abs(grid.edges[:, :2]).max(0)))) >= geometry.sod:
         raise ValueError(
-            f"use a smaller box: it reaches {reach:.4g} mm from the rotation axis, and the source is at "
-            f"{geometry.sod:.4g}"
+            f"use a smaller box: the box reaches {reach:.4g} mm from the rotation axis, but the source is only "
+            f"{geometry.sod:.4g} mm from the axis"
         )
     weights, zeros = cone_weights(geometry) if geometry.is_cone else ray_weights(geometry)
     # the part of Fourier space between two projections shrinks by this factor

@@ -79,11 +79,14 @@ def measured_law(
     """
     n = len(data)
     if geometry.is_cone:
-        raise ValueError("the law of the error can be measured only for a parallel beam, and this is a cone beam")
+        raise ValueError(
+            "the law of the error (how the error falls with the number of projections) can be measured only for a "
+            "parallel beam, and this scan has a cone beam"
+        )
     if n < LEAST_VIEWS or len(open_beam) < _LEAST_FRAMES:
         raise ValueError(
-            f"the law of the error needs {LEAST_VIEWS} projections and {_LEAST_FRAMES} frames of the open beam; "
-            f"got {n} and {len(open_beam)}"
+            f"to measure how the error falls with the number of projections, at least {LEAST_VIEWS} projections and "
+            f"{_LEAST_FRAMES} frames of the open beam are needed; got {n} projections and {len(open_beam)} frames"
         )
     sample = whole_reach(Views(data, geometry)).sample
     # width of the sample over that of the field of view
@@ -94,7 +97,9 @@ def measured_law(
     method = _TotalVariation(slab.chosen_weight())
     volumes = [slab.volume(method, slab.views, used) for used in (half, most)]
     if not volumes[1].any():
-        raise ValueError("the law of the error was not measured, because the projections show no sample")
+        raise ValueError(
+            "the error against the number of projections was not measured, because the projections show no sample"
+        )
     copy, second_copy = slab.copies(volumes[1], rng)
     copied = [slab.volume(method, copy, used) for used in (half, most)]
     errors = [slab.square_error(volume, volumes[1]) for volume in copied]

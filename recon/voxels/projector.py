@@ -86,8 +86,8 @@ class Projector:
         reach = float(np.hypot(*(np.abs(self.grid.edges[:, :2]).max(0) + beyond)))
         if self.geometry.is_cone and reach >= self.geometry.source_distance:
             raise ValueError(
-                f"use a smaller grid: with half a voxel beyond it, the box reaches {reach:.4g} mm from the rotation "
-                f"axis, and the source is at {self.geometry.source_distance:.4g} mm"
+                f"use a smaller grid: the grid, with half a voxel added on each side, reaches {reach:.4g} mm from "
+                f"the rotation axis, but the source is only {self.geometry.source_distance:.4g} mm from the axis"
             )
         bands = [
             (band, [self._rays(moment_views) for moment_views in views_of_exposure(views)])

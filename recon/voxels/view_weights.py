@@ -37,7 +37,7 @@ def angular_weights(angles: ArrayLike, whole_scan: ArrayLike | None = None) -> N
     """
     theta = np.mod(np.asarray(angles, dtype=np.float64).ravel(), np.pi)
     if theta.size == 0 or not np.isfinite(theta).all():
-        raise ValueError(f"weights need at least one angle, and all angles must be finite; got {theta.size} angles")
+        raise ValueError(f"FBP weights need at least one angle, and all angles must be finite; got {theta.size} angles")
     whole = None if whole_scan is None else np.asarray(whole_scan, np.float64).ravel()
     if theta.size == 1:
         return np.full(1, np.pi if whole is None else _usual_step(whole))
@@ -108,8 +108,8 @@ def circle_weights(angles: ArrayLike) -> F64:
     order, gaps = _gaps(theta)
     if _leave_an_arc(gaps):
         raise ValueError(
-            f"the angles have a gap of {np.rad2deg(gaps.max()):.4g} degrees, and these weights need the full circle. "
-            "For a short scan use `cone_weights`"
+            f"for a short scan use `cone_weights`: the angles have a gap of {np.rad2deg(gaps.max()):.4g} degrees, "
+            "but weights for a circle need the full circle"
         )
     weights = np.empty_like(theta)
     weights[order] = (gaps + np.roll(gaps, 1)) / 2
@@ -234,10 +234,10 @@ def cone_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
     order, beta, cells = _arc(geometry.angles)
     lacking = missing_arc(geometry)
     if lacking > 0:
-        need = f"another {np.rad2deg(lacking):.4g} degrees" if lacking < math.inf else "angles without several gaps"
+        more = f"{np.rad2deg(lacking):.4g} degrees more" if lacking < math.inf else "angles without several gaps"
         raise ValueError(
-            f"FDK needs {need}, because some rays through the field of view are in no projection. A full circle, or a "
-            "short scan of 180 degrees plus the fan angle, has them all. Or use an iterative method (fista-tv, sirt)"
+            "use an iterative method (fista-tv, sirt), or take a full circle or a short scan of 180 degrees plus the "
+            f"fan angle. FDK needs {more}, because some rays through the field of view are in no projection"
         )
     arc, gamma = float(cells.sum()), -_fan_angles(geometry)[order]
     most = (arc - np.pi) / 2

@@ -78,8 +78,8 @@ def test_any_kind_of_array_gives_the_same_volume(noisy: np.ndarray, kind: Callab
     [
         ({"method": "magic"}, "method 'magic' is unknown; legal: r2, .*fbp, "),
         ({"projections": np.zeros((3, 20, 40))}, "to match the geometry"),
-        ({"projections": np.full((24, 20, 40), np.nan)}, r"no usable value \(finite"),
-        ({"projections": np.full((24, 20, 40), 1e300)}, r"no usable value \(finite"),
+        ({"projections": np.full((24, 20, 40), np.nan)}, r"no usable value\. A usable value is finite"),
+        ({"projections": np.full((24, 20, 40), 1e300)}, r"no usable value\. A usable value is finite"),
         ({"projections": np.ones((24, 20, 40), complex)}, "real numbers"),
         ({"projections": np.zeros((24, 20, 40))}, "no material"),
         ({"method": R2(early_stop=True)}, "needs held-out projections"),

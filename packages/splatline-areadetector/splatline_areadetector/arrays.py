@@ -104,7 +104,10 @@ def array_frame(value: Any, received: float, is_current: bool = False) -> ArrayF
         raise FrameRefusedError(
             f"the pixels are compressed with {codec}, which "
             + ("changes the counts" if codec == "jpeg" else "this program cannot decode")
-            + f"; set Codec1:Compressor to one of {', '.join(NAMES)}, or take the image before that plugin"
+            + (
+                f"; set Codec1:Compressor to one of {', '.join(NAMES)}, or take the image from a plugin before the "
+                "codec plugin"
+            )
         )
     # The parameters of a codec have the type `any`: an int from servers of pvDatabase, None without a codec.
     element = ELEMENTS.get(int(value.codec.parameters or 0), "") if codec else pixels.dtype.str[1:]
@@ -131,14 +134,17 @@ def _refuse_colour(attributes: Mapping[str, Any], sizes: list[int]) -> None:
     if mode != _MONO or len(sizes) != 2:
         what = _COLOURS.get(mode, f"ColorMode {mode}") if mode != _MONO else f"in {len(sizes)} dimensions"
         raise FrameRefusedError(
-            f"the pixels are {what}, expected mono; set cam1:ColorMode to Mono (if the array is 3D, an earlier plugin "
-            f"makes it 3D)"
+            f"the pixels are {what}, but only single-colour images (Mono) can be stored; set cam1:ColorMode to "
+            "Mono. If ColorMode is Mono, look for an earlier plugin that makes the array 3D"
         )
 
 
 def _refuse_type(dtype: np.dtype[Any], codec: str, element: str) -> None:
     if codec and not element:
-        raise FrameRefusedError(f"the codec {codec} does not state the type of the pixels")
+        raise FrameRefusedError(
+            f"switch off compression (Codec1:Compressor None): frames with the codec {codec} do not state the type "
+            "of their pixels"
+        )
     if dtype not in COUNTS:
         raise FrameRefusedError(
             f"the pixels are {dtype}, but they must be uint8 or uint16; set cam1:DataType (or the DataType of the last "
@@ -150,8 +156,8 @@ def _refuse_size(shape: tuple[int, int], dtype: np.dtype[Any], codec: str, pixel
     n_bytes = dtype.itemsize * math.prod(shape)
     if not 0 < n_bytes <= MOST_BYTES or not (codec or pixels.nbytes == n_bytes):
         raise FrameRefusedError(
-            f"the frame has {pixels.nbytes} bytes, which does not match the dimensions, {shape[0]} x {shape[1]} "
-            f"{dtype}, or is more than {MOST_BYTES >> 20} MB"
+            f"the size of the frame is wrong: {shape[0]} x {shape[1]} pixels of {dtype} must have as many bytes as "
+            f"the array ({pixels.nbytes}), and at most {MOST_BYTES >> 20} MB"
         )
 
 
@@ -201,7 +207,10 @@ def decoded(codec: str, payload: NDArray[np.uint8], shape: tuple[int, int], dtyp
     n_bytes = dtype.itemsize * shape[0] * shape[1]
     held = int.from_bytes(payload[4:8].tobytes(), "little") if codec == "blosc" else _MOST_RATIO * payload.nbytes
     if held < n_bytes:
-        raise ValueError(f"the {codec} pixels cannot be decoded (there are fewer than {shape[0]} x {shape[1]})")
+        raise ValueError(
+            f"the {codec} pixels cannot be decoded, because the compressed data hold fewer than {shape[0]} x "
+            f"{shape[1]} pixels"
+        )
     chunk = payload.tobytes()
     if not chunk.startswith(struct.pack(">Q", n_bytes)):  # pvapy's simulator sends chunks with their header
         chunk = with_header(chunk, n_bytes, dtype.itemsize)

@@ -36,7 +36,9 @@ class AreaDetectorSettings:
     sensor: tuple[int, int] = setting(..., "Rows and columns of the sensor.")
     readout: float = setting(..., "Read-out time of a full frame.", unit="s", gt=0, le=100)
     electrons_per_count: float = setting(..., "Electrons per count, from the data sheet.", gt=0, le=1e6)
-    image: str | None = setting(None, "Where the frames come from, pva://NAME; null: PREFIXPva1:Image.")
+    image: str | None = setting(
+        None, "Address of the image that carries the frames, pva://NAME; null: PREFIXPva1:Image."
+    )
     line: str = setting("Line0", "The camera's input for trigger pulses (spinnaker).")
     min_period: float = setting(0.0, "Shortest time between two triggers.", unit="s", ge=0, le=100)
     dead: float = setting(
@@ -178,7 +180,10 @@ class AreaDetectorCamera:
         """Expose one frame. Raises DeviceRefused: not armed, or configured for another trigger."""
         if not self._armed or self._settings.trigger is not TriggerSource.SOFTWARE:
             armed = "armed" if self._armed else "not armed"
-            problem = f"the camera cannot take a software trigger now ({armed}, trigger {self._settings.trigger})"
+            problem = (
+                f"the camera cannot take a software trigger now: it is {armed}, and its trigger is set to "
+                f"{self._settings.trigger}"
+            )
             raise DeviceRefused(self.name, problem, advice="Configure the trigger as software and arm it")
         if self._labels.fire:
             self._records.write(f"cam1:{self._labels.fire}", 1)
@@ -204,8 +209,9 @@ class AreaDetectorCamera:
             lost, self._lost = self._lost, 0
             if lost:
                 raise DeviceError(
-                    self.name, f"the ring of {self._ring_size} frames was overrun and {lost} frames are lost",
-                    advice="Take frames faster, trigger more slowly, or raise ring_mb",
+                    self.name,
+                    f"{lost} frames are lost, because the memory for {self._ring_size} waiting frames was full",
+                    advice="Fetch frames faster, trigger more slowly, or raise ring_mb (memory for waiting frames)",
                     state="Later frames can be taken",
                 )  # fmt: skip
             if self._ring:
@@ -271,7 +277,8 @@ class AreaDetectorCamera:
                 self.name,
                 f"the sensor of the camera has {rows} x {cols} pixels, but devices.camera.sensor states "
                 f"{list(self._own.sensor)}",
-                advice="Correct `sensor`, or `prefix` if it is another camera", state="Nothing was set",
+                advice="Correct `sensor`; if `prefix` names another camera than you want, correct `prefix`",
+                state="Nothing was set",
             )  # fmt: skip
 
     def _applied(self, wanted: CameraSettings) -> CameraSettings:
@@ -325,11 +332,12 @@ class AreaDetectorCamera:
                 self._fail(f"its frames cannot be stored: {why}")
             case Died(code):
                 self._fail(
-                    f"the process that receives its frames has ended (exit code {code}); a new one is being started",
+                    f"the process that receives the camera's frames has ended (exit code {code}); a new process is "
+                    "being started",
                     state="Frames taken before are good",
                 )
             case Disconnected():
-                advice = "Check whether it runs; the camera continues when the IOC is back"
+                advice = "Check whether the camera's IOC runs; the camera continues when the IOC is back"
                 self._fail("the connection to its IOC was lost", advice, "Frames taken before are good")
             case ArrayFrame(is_current=False):
                 self._take_frame(item)
@@ -344,8 +352,7 @@ class AreaDetectorCamera:
         if item.window.shape != shape:
             self._fail(
                 f"the frames have {item.window.shape[0]} x {item.window.shape[1]} pixels, but {shape[0]} x {shape[1]} "
-                "were "
-                "set", "Check Pva1:NDArrayPort: it may name a plugin that bins or crops",
+                "were set", "Check Pva1:NDArrayPort: the port may be that of a plugin that bins or crops frames",
             )  # fmt: skip
             return
         if self._origin is None:

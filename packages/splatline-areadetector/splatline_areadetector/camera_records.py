@@ -114,7 +114,10 @@ class Records:
                 raise DeviceRefused(
                     self._name, f"{record} did not accept {value!r}", request=f"{self._prefix}{record} = {value}",
                     reply=f"{record}_RBV is {shown!r}", state="Other settings may have changed",
-                    advice="Try it in the camera's control screen, and check `driver`",
+                    advice=(
+                        "Try this setting in the camera's control screen, and check that `driver` names the "
+                        "camera's driver"
+                    ),
                 )  # fmt: skip
             self._clock.sleep(LOOK_EVERY)
         return shown

@@ -47,8 +47,10 @@ def _print_example(ctx: click.Context, param: click.Parameter, value: bool) -> N
 )
 @click.option(
     "--reference", metavar="GOOD", type=click.Path(path_type=Path, exists=True),
-    help="Volume of the same sample from an earlier, careful scan, or that scan itself; used as by `beamline scan`. "
-    "The same as recon.reference in CONFIG.",
+    help=(
+        "Volume of the same sample from an earlier scan with many projections, or the file of the earlier scan. The "
+        "live volume uses it as in `beamline scan`. The same as recon.reference in CONFIG."
+    ),
 )  # fmt: skip
 @click.option("--page", is_flag=True, help="Show the runs in the browser; all runs have the same address.")
 @click.option("--no-live", is_flag=True, help="Do not reconstruct during the scan.")

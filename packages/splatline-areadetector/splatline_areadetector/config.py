@@ -92,14 +92,20 @@ class RideSection(Section):
     )
     flats: Fields = Fields(count=0)
     camera: Prefix | None = setting(
-        None, "Prefix of the camera's variables, such as ca://2bmSP2:cam1:; null: not used."
+        None,
+        (
+            "Prefix of the camera's process variables, such as ca://2bmSP2:cam1:; null: the camera's variables are "
+            "not read."
+        ),
     )
     source: str | None = setting(
         None, "Port of areaDetector whose frames are stored unchanged, such as ROI1; null: the camera's own frames.",
         min_length=1,
     )  # fmt: skip
     first_id: int | None = setting(
-        None, "uniqueId of the first projection; null: that of the first projection that arrives.", ge=0
+        None,
+        "uniqueId of the first projection of the scan; null: the uniqueId of the first projection that arrives.",
+        ge=0,
     )
     exposure_s: Seconds | None = setting(
         None,
@@ -113,12 +119,14 @@ class RideSection(Section):
         None, "Bits of a pixel, for the saturation value; null: all bits of the pixel type.", ge=1, le=16
     )
     queue_s: float = setting(1.0, "Frames that the server buffers for this program, in seconds.", gt=0, le=60)
-    queue_mb: float = setting(512.0, "Largest memory of the IOC for this buffer, in MB.", gt=0, le=65_536)
+    queue_mb: float = setting(
+        512.0, "Largest memory of the IOC for frames that the server buffers for this program, in MB.", gt=0, le=65_536
+    )
     ring_mb: float = setting(
         2048.0, "Largest memory of this program for frames that wait for the disk, in MB.", gt=0, le=1e6
     )
     silence_s: Seconds = setting(
-        60.0, "After this time without a frame a message gives the reason, as far as the IOC shows it."
+        60.0, "If no frame comes for this time, a message gives the reason, as far as the IOC shows it."
     )
 
     @property

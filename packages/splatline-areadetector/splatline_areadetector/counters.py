@@ -86,15 +86,17 @@ class Counters:
         dropped = self.plugin.histories["DroppedArrays_RBV"].rise(begin, end)
         counted = self.plugin.histories["ArrayCounter_RBV"].rise(begin, end)
         if dropped:
-            return f"by the plugin {self.plugin.prefix}, whose queue was full (DroppedArrays rose by {dropped:.0f})"
+            return (
+                f"lost by the plugin {self.plugin.prefix}, whose queue was full (DroppedArrays rose by {dropped:.0f})"
+            )
         if counted is None:
-            return "before this program received them (no counter of the IOC shows where)"
+            return "lost before this program received frames (no counter of the IOC shows where)"
         if counted > len(gap.ids):
             return (
-                "between the plugin and this program: in the network, or in the server's queue for this program "
-                "(ride.queue_s)"
+                "lost between the plugin and this program: in the network, or in the server's queue for this "
+                "program (ride.queue_s)"
             )
-        return f"by the camera or its driver, before the plugin {self.plugin.prefix}"
+        return f"lost by the camera or its driver, before the plugin {self.plugin.prefix}"
 
 
 def loss_sentences(gaps: Sequence[Gap], overflowed: Collection[int], counters: Counters) -> list[str]:
@@ -108,15 +110,16 @@ def loss_sentences(gaps: Sequence[Gap], overflowed: Collection[int], counters: C
         for i in gap.ids:
             if i in overflowed:
                 cause = (
-                    f"by {OURS}: its memory for waiting frames was full, because the disk is too slow (ride.ring_mb)"
+                    f"lost by {OURS}: its memory for waiting frames was full, because the disk is too slow "
+                    "(ride.ring_mb)"
                 )
             elif gap.still > _LONG:
-                cause = f"by {OURS}, which stalled for {gap.still:.1f} s (ride.queue_s)"
+                cause = f"lost by {OURS}, which stalled for {gap.still:.1f} s (raise ride.queue_s to buffer longer)"
             else:
                 cause = counters.blame(gap)
             causes.setdefault(cause, []).append(i)
     return [
-        f"Frame{'s' * (len(ids) > 1)} {spans(ids)} {'were' if len(ids) > 1 else 'was'} lost {cause}."
+        f"Frame{'s' * (len(ids) > 1)} {spans(ids)} {'were' if len(ids) > 1 else 'was'} {cause}."
         for cause, ids in causes.items()
     ]
 
@@ -151,10 +154,14 @@ class Silence:
         if self.lasted < self._seconds:
             return
         self.frame_came()
-        silent = f"o frame for {self._seconds:g} s"
         if not self._stream.answers():
-            raise InstrumentError(f"{self._stream.name}: n{silent}, and its server does not answer. {self._outcome()}")
-        self._say(f"N{silent}, although the server answers: {silence_sentence(self._counters)}.")
+            raise InstrumentError(
+                f"{self._stream.name}: no frame came for {self._seconds:g} s, and its server does not answer. "
+                f"{self._outcome()}"
+            )
+        self._say(
+            f"No frame came for {self._seconds:g} s, although the server answers: {silence_sentence(self._counters)}."
+        )
 
 
 def silence_sentence(counters: Counters) -> str:

@@ -95,8 +95,9 @@ class _Kinds:
 
 def _lacking(key: str, name: str, frame: ArrayFrame) -> str:
     return (
-        f"The frames have no attribute {name} (ride.{key}); they have {', '.join(frame.attributes) or 'none'}. Add it "
-        f"to the camera's NDAttributesFile, or change ride.{key}. Frames that came before, if any, are in the file."
+        f"The frames have no attribute {name} (ride.{key}); they have {', '.join(frame.attributes) or 'none'}. Add "
+        f"{name} to the camera's NDAttributesFile, or change ride.{key}. Earlier frames, if there were any, are in "
+        "the file."
     )
 
 
@@ -210,8 +211,8 @@ class PandaGuide(_ByNumbers):
         ends = " to ".join(f"{math.degrees(self._radians(i)):.6g}°" for i in (0, -1))
         rows = count(self._rows.size, "row")
         return (
-            f"{self._path} has {rows}, {ends}. These are the angles of this scan, unless the PandABox writes the "
-            f"file again"
+            f"{self._path} has {rows}, with angles {ends}. The scan gets these angles, unless the PandABox writes "
+            "the file again"
         )
 
     def plan(self) -> RidePlan:
@@ -231,7 +232,7 @@ class PandaGuide(_ByNumbers):
             if trigger >= (n := self._rows.size) and (n == self._waited_at or time.monotonic() > deadline):
                 self._waited_at = n
                 if problem and not n:
-                    raise DataError(f"No projection has an angle: {problem}. Frames that came before are in the file.")
+                    raise DataError(f"No projection has an angle: {problem}. Earlier frames are in the file.")
                 return math.nan
             if trigger >= n:
                 time.sleep(_POLL)
@@ -257,8 +258,8 @@ class PandaGuide(_ByNumbers):
             return str(error).removesuffix(".")
         if n > views and not problem:
             problem = (
-                f"has {n} rows, but ride.angles.views is {views}: if the file belongs to another scan, move it away, "
-                "otherwise correct views"
+                f"has {n} rows, but ride.angles.views is {views}. If the file belongs to another scan, move the "
+                "file away; otherwise correct ride.angles.views"
             )
         return problem and f"{self._path}: {name} {problem}"
 
@@ -273,7 +274,10 @@ def _panda_problem(rows: Any) -> str:
         what = f"has the shape {rows.shape}, not one number for each trigger"
     else:
         return ""
-    return f"{what}; set ride.angles.dataset to the positions, such as {PandaAngles.model_fields['dataset'].default}"
+    return (
+        f"{what}; set ride.angles.dataset to the dataset with the positions, such as "
+        f"{PandaAngles.model_fields['dataset'].default}"
+    )
 
 
 def _unit_problem(rows: NDArray[np.float64], settings: PandaAngles) -> str:
@@ -283,26 +287,26 @@ def _unit_problem(rows: NDArray[np.float64], settings: PandaAngles) -> str:
     degrees = settings.offset_deg + settings.deg_per_unit * known
     if known.size and (np.abs(degrees) > MOST_DEGREES).all():
         return (
-            f"has positions from {known.min():.7g} to {known.max():.7g}, which is more than {MOST_DEGREES:g} degrees "
-            "from zero; set ride.angles.deg_per_unit if they are encoder counts, and ride.angles.offset_deg to bring "
-            "the first angle near zero"
+            f"gives angles that are all more than {MOST_DEGREES:g} degrees from zero (positions {known.min():.7g} "
+            f"to {known.max():.7g}). If the positions are encoder counts, set ride.angles.deg_per_unit; set "
+            "ride.angles.offset_deg to bring the first angle near zero"
         )
     if rows.size < _FEW or "deg_per_unit" in settings.model_fields_set:
         return ""
     step = 0.0 if known.size < _FEW else float(np.median(np.abs(np.diff(known))))
     if not step:
         whole = rows.size == settings.views
-        return f"has {known.size} positions in {rows.size} rows, but they do not change" if whole else ""
+        return f"has {known.size} positions in {rows.size} rows, but the positions do not change" if whole else ""
     spans = step * np.array([[settings.views], [settings.views - 1]])
     if (np.abs(spans / (math.pi * np.array([1, 2])) - 1) < _NEAR).any():
         return (
-            f"has steps of {step:.4g}, which look like radians; set ride.angles.deg_per_unit to {math.degrees(1):.7g} "
-            "(or, if they are degrees, to 1)"
+            f"has steps of {step:.4g}, which look like radians; set ride.angles.deg_per_unit to "
+            f"{math.degrees(1):.7g} (or, if the positions are degrees, to 1)"
         )
     if step > 180 or (spans[0] > 400 and not (known % 1).any()):
         return (
             f"has steps of {step:.6g}, which look like encoder counts; set ride.angles.deg_per_unit to 360 / counts "
-            "per turn (or, if they are degrees, to 1)"
+            "per turn (or, if the positions are degrees, to 1)"
         )
     return ""
 

@@ -25,7 +25,7 @@ def check(config: RideConfig) -> list[str]:
             "image": stream.name,
             "frames": _size(frames[-1] if frames else stream.first),
             "port": counters.plugin.text("NDArrayPort_RBV")
-            or "not known, because the variables of the plugin do not answer",
+            or "not known, because the IOC does not answer for the plugin's process variables",
             "queue": f"{stream.queue} frames in the server",
             "arrival": _arrival(frames) or f"no frame in {SECONDS:g} s: {silence_sentence(counters)}",
             "refused": refused,
@@ -73,4 +73,4 @@ def _arrival(frames: list[ArrayFrame]) -> str:
 
 def _dropped(counters: Counters) -> str:
     dropped = counters.plugin.number("DroppedArrays_RBV")
-    return "" if dropped is None else f"{dropped:.0f} arrays, by the plugin, since its counter was reset"
+    return "" if dropped is None else f"{dropped:.0f} arrays dropped by the plugin since DroppedArrays was reset"

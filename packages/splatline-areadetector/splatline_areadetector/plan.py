@@ -83,7 +83,9 @@ def timeline_of(plan: RidePlan, shape: tuple[int, int], preview_bin: int, free: 
     total = n_frames * (frame_bytes + 4 * math.prod(preview_shape(shape, preview_bin)))
     remarks = ["another program runs the scan; beamline ride does not pause or repeat anything, and moves no device"]
     if total > free:
-        remarks.append(f"free space on the disk during the scan: it needs {size(total)}, and {size(free)} are free")
+        remarks.append(
+            f"free space on the disk during the scan: the scan needs {size(total)}, and {size(free)} are free"
+        )
     return Timeline(blocks, n_frames * period, frame_bytes, total, 0, 0.0, 0.0, 0.0, (), tuple(remarks), _plan_of(plan))
 
 

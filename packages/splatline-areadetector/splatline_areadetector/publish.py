@@ -69,8 +69,8 @@ def publish(runs: Path, prefix: str, bind: str, port: int | None, files: Path | 
         put = RecordServer(prefix, records(name), bind, detector.asked).put
         with closing(detector), closing(RunFrames(runs, say)) as frames, suppress(KeyboardInterrupt):
             click.echo(
-                f"Publishing {name} at {bind}:{image.port}, with {prefix}cam1: and {prefix}HDF1:. Ctrl-C ends the "
-                "publishing, not the scan."
+                f"Publishing the image {name} at {bind}:{image.port}, and the records {prefix}cam1: and "
+                f"{prefix}HDF1:. Ctrl-C ends the publishing, not the scan."
             )
             _follow(frames, image, detector, put)
 

@@ -97,7 +97,7 @@ class RiddenFrames:
         self._row = self._views = 0
         self._silence = Silence(
             ride.stream, ride.counters, ride.config.ride.silence_s, self._warn,
-            lambda: f"Frames that came before are in the file.{self._loss_sentences(ended=False)}",
+            lambda: f"Earlier frames are in the file.{self._loss_sentences(ended=False)}",
         )  # fmt: skip
 
     @property
@@ -149,7 +149,8 @@ class RiddenFrames:
                     )
                 case Died(code):
                     self._warn(
-                        f"The process that receives frames has ended (exit code {code}); a new one is being started."
+                        f"The process that receives frames has ended (exit code {code}); a new process is being "
+                        "started."
                     )
                 case Overflow(unique_id):
                     self._overflowed.add(unique_id)
@@ -158,8 +159,8 @@ class RiddenFrames:
                         self._gaps.append(Gap(lost, self._last.time, self._last.time))
                 case Refused(unique_id, why):
                     raise DataError(
-                        f"Frame {unique_id} of {self._stream.name} cannot be stored: {why}. Frames that came before "
-                        "are in the file."
+                        f"Frame {unique_id} of {self._stream.name} cannot be stored: {why}. Earlier frames are in "
+                        "the file."
                     )
                 case ArrayFrame():
                     if item.is_current and self._arrived is not None and item.time <= self._arrived.time:
@@ -256,8 +257,8 @@ class RiddenFrames:
         assert self._last is not None
         (before, dtype), (after, dtype_after) = self._last.kind, frame.kind
         return (
-            f"frames from number {frame.unique_id} on are {after.shape[0]} x {after.shape[1]} {dtype_after}, before "
-            f"{before.shape[0]} x {before.shape[1]} {dtype}"
+            f"frames from number {frame.unique_id} on have {after.shape[0]} x {after.shape[1]} pixels of "
+            f"{dtype_after}, and earlier frames {before.shape[0]} x {before.shape[1]} pixels of {dtype}"
             + ("" if (before.shape, dtype) != (after.shape, dtype_after) else ", and show another part of the sensor")
         )
 
@@ -268,7 +269,7 @@ class RiddenFrames:
             if math.isnan(angle):
                 kind = FrameKind.INVALID
                 self._sorter.lose(place)
-                self._cannot_use(frame, f"{self._guide.unknown_angle}, so such a frame is stored as an invalid row")
+                self._cannot_use(frame, f"{self._guide.unknown_angle}, so the frame is stored as an invalid row")
             else:
                 self._views += 1
         seconds = seconds_of(frame.attributes.get(EXPOSURE)) or self._plan.exposure(place.kind)
@@ -298,7 +299,10 @@ class RiddenFrames:
     def _refuse_pause(self) -> None:
         reason = self._measurement.pause.reason
         if reason and reason != self._reported_pause:
-            self._warn(f"The scan should pause ({reason}), but another program runs it, and it continues.")
+            self._warn(
+                "The scan continues without a pause, because another program runs it. The reason for a pause: "
+                f"{reason}."
+            )
         self._reported_pause = reason
         self._measurement.pause.resume()
 
@@ -344,15 +348,15 @@ class RiddenFrames:
         angles, basis, n = self._plan.angles, self._sorter.basis, self._sorter.n_left
         if n == 0 or not self._views or basis.is_sure or (basis is Basis.WAITED and not ended):
             return ""
-        off = f"the true angle of each projection is that of the projection {n} places later"
+        off = f"the true angle of each projection is the stated angle of the projection {n} places later"
         if n < angles.size and not np.isnan(angles).any():
             off = f"all angles are {math.degrees(angles[n] - angles[0]):.4g}° larger than stated"
         has_angles = self._plan.angle_source == "attribute"
         if self._sorter.is_by_order and len(self._plan.blocks) > 1:
             off = "" if has_angles else f", and {off}"
             off = (
-                "the first and last frames of each block are stored with the kind of the neighbouring block"
-                f"{off}. Set ride.kinds"
+                "the first and last frames of each block are stored as frames of the neighbouring block (dark, flat "
+                f"or projection){off}. Set ride.kinds"
             )
         elif has_angles:
             return ""
@@ -378,7 +382,9 @@ class RiddenFrames:
             )
         if self._epoch:
             raise EpochEndedError(
-                f"{sentences.strip()} The file was closed there, because {self._epoch}.{self._others}", self.missing
+                f"{sentences.strip()} The file was closed before the end of the scan, because "
+                f"{self._epoch}.{self._others}",
+                self.missing,
             )
         if self.missing:
             raise LedgerError(f"{sentences.strip()}{self._others}", self.missing)

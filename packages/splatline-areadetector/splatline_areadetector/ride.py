@@ -175,9 +175,9 @@ def _with_given(plan: RidePlan, given: Images, shape: tuple[int, int]) -> RidePl
     for kind, images in given.items():
         if images.shape[1:] != shape:
             raise ConfigError(
-                f"The frames of --{kind.name.lower()}s have {images.shape[1]} x {images.shape[2]} pixels, those of the "
-                f"camera {shape[0]} x {shape[1]}: give frames with the camera's region and binning. Nothing was "
-                "recorded."
+                f"The frames of --{kind.name.lower()}s have {images.shape[1]} x {images.shape[2]} pixels, but the "
+                f"camera's frames have {shape[0]} x {shape[1]}: give frames with the camera's region and binning. "
+                "Nothing was recorded."
             )
     blocks = tuple(PlannedBlock(kind, len(images)) for kind, images in given.items())
     return replace(plan, blocks=(*blocks, *plan.blocks))
@@ -196,7 +196,7 @@ def load_given(darks: str | None, flats: str | None) -> Images:
         counts = np.rint(images)  # averaged frames of other programs are floating-point numbers
         if not (images.size and counts.min() >= 0 and counts.max() <= np.iinfo(np.uint16).max):
             raise ConfigError(
-                f"--{kind.name.lower()}s {name} must hold counts, numbers from 0 to 65535. Nothing was recorded."
+                f"--{kind.name.lower()}s {name} must hold counts (numbers from 0 to 65535). Nothing was recorded."
             )
         images_of_kinds[kind] = counts.astype(np.uint16)
     return images_of_kinds

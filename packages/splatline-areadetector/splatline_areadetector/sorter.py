@@ -88,8 +88,8 @@ class _Taken:
 def not_set(number: int) -> str:
     """The message about numbers that stay the same."""
     return (
-        "Let the server set uniqueId of its NTNDArray to the count of frames, because beamline ride identifies "
-        f"frames by it: uniqueId stays at {number} while the pixels change"
+        "Let the server count frames in the uniqueId of its NTNDArray, because beamline ride identifies frames by "
+        f"their uniqueId: uniqueId stays at {number} while the pixels change"
     )
 
 
@@ -225,15 +225,15 @@ class Sorter:
     def _new_epoch(self, seen: Seen, last: Seen, block: _Taken) -> str:
         """The reason why the file ends, if numbers have restarted; "" if the file does not end."""
         if (seen.number, seen.phase) == (last.number, last.phase) and not (seen.reconnected or block.is_over):
-            raise DataError(f"{not_set(seen.number)}. Frames that came before are in the file.")
+            raise DataError(f"{not_set(seen.number)}. Earlier frames are in the file.")
         is_same = seen.phase in (BY_ORDER, UNKNOWN_KIND) or (
             seen.phase.kind is block.kind and (block.kind is VIEW or seen.phase.serial == self._serial)
         )
         if not seen.reconnected and (block.is_over or not is_same):
             return ""
         return (
-            f"frame numbers restarted at {seen.number}, after {last.number} (the server restarted, or its counter was "
-            "reset)"
+            f"frame numbers restarted at {seen.number}, after {last.number} (the server restarted, or the server's "
+            "counter was reset)"
         )
 
     def _learn_step(self, seen: Seen, last: Seen, block: _Taken) -> None:
@@ -258,9 +258,9 @@ class Sorter:
             block.triggers = {i for number in numbers if (i := (number - block.first) // step) < block.n}
         elif step > 1:
             self._note = (
-                f"Frame numbers rise by {step}, because a plugin averages {step} frames or passes on one in {step}. "
-                "Each frame that arrives counts as a frame of the plan. If the plan counts the camera's frames, take "
-                "the image before that plugin (NDArrayPort)."
+                f"Frame numbers rise by {step}, because a plugin averages {step} frames, or passes on only one of "
+                f"{step} frames. Each frame that arrives counts as a frame of the plan. If the plan counts the "
+                "camera's frames, take the image before that plugin (NDArrayPort)."
             )
         self._step = block.step = step
 
@@ -293,7 +293,7 @@ class Sorter:
             return self._outside(seen, block)
         if rest:
             return Unknown(
-                f"the numbers of frames rise by {block.step}, but the number of this frame is between two of these "
+                f"frame numbers rise by {block.step}, but the number of this frame is between two expected frame "
                 "numbers"
             )
         skipped, block.last = range(block.trigger(block.last) + 1, trigger), seen.number
@@ -372,7 +372,9 @@ class Sorter:
             if 0 <= lost < n and lost <= gap:
                 words = count(lost, noun)
                 self._note = (
-                    f"Before the first {noun} that arrived, the camera had counted {words}." if lost else self._note
+                    f"The camera had counted {words} before the first {noun} that arrived, so the scan lost {words}."
+                    if lost
+                    else self._note
                 )
                 return lost, Basis.COUNTER
         is_known = seen.phase == BY_ORDER and bool(
@@ -385,9 +387,9 @@ class Sorter:
         if is_late:
             off = "" if block.kind is VIEW else "the kinds of frames and "
             self._note = (
-                f"Frame {seen.number} counts as the first {noun} of the scan, but others may have come before it. In "
-                f"that case {off}all angles are wrong by the number of lost steps. To avoid this, set "
-                f"{'ride.camera' if block.kind is VIEW else 'ride.kinds'} or ride.first_id."
+                f"Frame {seen.number} counts as the first {noun} of the scan, but earlier {noun}s may be lost. If "
+                f"earlier {noun}s are lost, {off}all angles are wrong by the number of lost steps. To avoid wrong "
+                f"angles, set {'ride.camera' if block.kind is VIEW else 'ride.kinds'} or ride.first_id."
             )
         return 0, Basis.UNKNOWN if is_late else Basis.WAITED
 
@@ -401,8 +403,8 @@ class Sorter:
         trigger = views.trigger(views.last) + 1 + lost
         self._note = (
             f"Darks or flats came between the projections. The projections continue with projection {trigger} at "
-            "number "
-            f"{seen.number}" + (f", because {lost} were lost before and after the other frames." if lost else ".")
+            f"frame number {seen.number}"
+            + (f", because {lost} were lost before and after the other frames." if lost else ".")
         )
         views.first, views.count_restarts = seen.number - trigger * views.step, seen.count_restarts
         views.first_frame_of_other_kind = None
@@ -421,7 +423,9 @@ class Sorter:
                 is_long = len(times) > 2 and time - times[-1] > 1.5 * float(np.median(np.diff(times)))
                 if last < top or raw > low + 1 or (raw != low and is_long):
                     left_out = "" if self._last_wrap > top - low else f", and {low} as if it had been skipped"
-                    self._note = f"Numbers went from {last} to {raw}: the count is continued beyond {top}{left_out}."
+                    self._note = (
+                        f"Frame numbers went from {last} to {raw}: the count is continued beyond {top}{left_out}."
+                    )
             elif self._last_wrap and top - _NEAR <= raw <= top and low <= last <= low + _NEAR:
                 self._raw = last  # exchanged with its neighbour
                 return raw + self._wrapped - self._last_wrap

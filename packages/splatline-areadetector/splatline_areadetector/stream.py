@@ -33,7 +33,7 @@ _STARTS, _AGAIN = 60.0, 0.5  # s for a receiver to start, and before another one
 _AT_HAND = 4  # number of items in this process; all other items wait in the receiver
 _PIPE = 2**20  # bytes
 ANSWERS_WITHIN = 3.0  # s
-UNREACHABLE = "Check the name, whether its IOC runs, and which hosts are searched (EPICS_PVA_ADDR_LIST)"
+UNREACHABLE = "Check the name of the image, whether the IOC runs, and which hosts EPICS searches (EPICS_PVA_ADDR_LIST)"
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ class FrameStream:
                 self.name,
                 f"no answer within {within:g} s",
                 advice=UNREACHABLE,
-                state="The value was only read, and nothing was changed",
+                state="This program only read the image, and changed nothing",
             ) from None
         except RemoteError as error:
             raise ConfigError(

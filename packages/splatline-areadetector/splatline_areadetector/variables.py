@@ -129,8 +129,10 @@ class Variables:
                 url,
                 f"no answer within {_ANSWER:g} s",
                 request=", ".join(self.prefix + name for name in silent),
-                advice="Check the prefix, whether its IOC runs, and which hosts are searched (EPICS_CA_ADDR_LIST, "
-                "EPICS_PVA_ADDR_LIST)",
+                advice=(
+                    "Check the prefix, whether the IOC runs, and which hosts EPICS searches (EPICS_CA_ADDR_LIST, "
+                    "EPICS_PVA_ADDR_LIST)"
+                ),
                 state="Nothing was started",
             )
 

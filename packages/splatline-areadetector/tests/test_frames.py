@@ -73,7 +73,7 @@ def test_sizes_that_no_frame_has_are_refused_before_memory_is_taken(codec: str, 
         value.codec = {"name": codec, "parameters": 6}
     value.dimension = [{"size": n, "offset": 0, "fullSize": n, "binning": 1, "reverse": False} for n in sides]
     began = time.monotonic()
-    with pytest.raises(FrameRefusedError, match=f"match the dimensions, {sides[1]} x {sides[0]} uint16, or is more"):
+    with pytest.raises(FrameRefusedError, match=f"the frame is wrong: {sides[1]} x {sides[0]} pixels of uint16"):
         array_frame(value, 0.0)
     assert time.monotonic() - began < 1
 
@@ -81,7 +81,9 @@ def test_sizes_that_no_frame_has_are_refused_before_memory_is_taken(codec: str, 
 @pytest.mark.parametrize("codec", CODECS)
 def test_pixels_that_a_message_cannot_hold_are_not_looked_for(codec: str) -> None:
     tracemalloc.start()
-    with pytest.raises(ValueError, match=r"pixels cannot be decoded \(there are fewer than 16384 x 16384\)"):
+    with pytest.raises(
+        ValueError, match=r"pixels cannot be decoded, because the compressed data hold fewer than 16384 x 16384"
+    ):
         decoded(codec, np.ones(4096, np.uint8), (16384, 16384), np.dtype("u2"))
     assert tracemalloc.get_traced_memory()[1] < 1e6
     tracemalloc.stop()
@@ -102,8 +104,8 @@ def test_window_and_attributes() -> None:
     ("changed", "sentence"),
     [
         ({"codec": {"name": "zfp", "parameters": 6}}, "with zfp, which this program cannot decode; set Codec1:Comp"),
-        ({"codec": {"name": "blosc", "parameters": 0}}, "the codec blosc does not state the type of the pixels"),
-        ({"attributes": {"ColorMode": 1}}, "the pixels are Bayer, expected mono"),
+        ({"codec": {"name": "blosc", "parameters": 0}}, "frames with the codec blosc do not state the type"),
+        ({"attributes": {"ColorMode": 1}}, "the pixels are Bayer, but only single-colour images"),
     ],
 )
 def test_what_is_no_frame_of_counts(changed: dict[str, Any], sentence: str) -> None:

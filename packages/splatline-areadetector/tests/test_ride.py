@@ -227,8 +227,14 @@ def test_a_lower_number_or_another_size_begins_another_file(tmp_path: Path) -> N
     with FakeIoc() as ioc:
         told = ride_along(config_of(tmp_path, ioc.url), tmp_path, scan)
     assert isinstance(told.error, LedgerError)
-    assert "frame numbers restarted at 1, after 59 (the server restarted, or its counter was reset)" in told.warnings
-    assert "frames from number 6 on are 8 x 24 uint16, before 16 x 24 uint16" in told.warnings
+    assert (
+        "frame numbers restarted at 1, after 59 (the server restarted, or the server's counter was reset)"
+        in told.warnings
+    )
+    assert (
+        "frames from number 6 on have 8 x 24 pixels of uint16, and earlier frames 16 x 24 pixels of uint16"
+        in told.warnings
+    )
     files = stored(tmp_path)
     assert [file.ids.tolist() for file in files] == [[*range(50, 60)], [*range(1, 6)], [*range(6, 26)]]
     assert [file.status for file in files] == ["failed", "failed", "complete"]
@@ -251,7 +257,7 @@ def test_the_cameras_count_shows_that_the_first_projections_were_lost(tmp_path: 
         told = ride_along(config_of(tmp_path, ioc.url, camera="pva://T:cam1:"), tmp_path, scan)
     (file,) = stored(tmp_path)
     assert np.allclose(file.degrees, 9.0 * (file.ids - 100)) and file.missing == list(range(lost))
-    assert ("the camera had counted 2 projections" in told.warnings) is bool(lost)
+    assert ("The camera had counted 2 projections before" in told.warnings) is bool(lost)
 
 
 def test_a_stop_and_a_stop_before_the_first_frame(tmp_path: Path) -> None:
@@ -296,7 +302,11 @@ def test_settings_that_are_refused(
 @pytest.mark.parametrize(
     ("value", "ride", "sentence"),
     [
-        ({"attributes": {"ColorMode": 2}}, {}, "are RGB1, expected mono; set cam1:ColorMode to Mono"),
+        (
+            {"attributes": {"ColorMode": 2}},
+            {},
+            "are RGB1, but only single-colour images (Mono) can be stored; set cam1:ColorMode to Mono",
+        ),
         ({"counts": np.zeros((4, 4), np.float32)}, {}, "pixels are float32, but they must be uint8 or uint16; set"),
         ({"counts": np.zeros((4, 4), np.int16)}, {}, "pixels are int16"),
         ({"codec": {"name": "jpeg", "parameters": 5}}, {}, "compressed with jpeg, which changes the counts"),
@@ -342,7 +352,7 @@ def test_no_server_and_no_frames(tmp_path: Path) -> None:
             stop.stop("enough")
 
         told = ride_along(config, tmp_path, scan)
-    assert "No frame for 0.2 s, although the server answers: the camera does not acquire" in " ".join(told.before)
+    assert "No frame came for 0.2 s, although the server answers: the camera does not acquire" in " ".join(told.before)
 
 
 def test_tomoscan_without_angles_is_refused(tmp_path: Path) -> None:

@@ -148,7 +148,8 @@ def test_a_first_dark_that_was_lost_shifts_kinds_by_order_which_is_said(tmp_path
         in (said := str(told.error))
     )
     assert (
-        "the first and last frames of each block are stored with the kind of the neighbouring block, and all angles "
+        "the first and last frames of each block are stored as frames of the neighbouring block (dark, flat or "
+        "projection), and all angles "
         "are 9° larger than stated. Set ride.kinds" in said
     )
 

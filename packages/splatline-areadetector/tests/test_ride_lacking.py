@@ -116,8 +116,8 @@ def test_a_pandaboxs_file_with_fewer_rows_than_views(tmp_path: Path) -> None:
     with FakeIoc() as ioc:
         told = ride_along(config_of(tmp_path, ioc.url, angles), tmp_path, lambda stop: ioc.send(range(1, 21)))
     assert (
-        "panda.h5 has 12 rows, 0° to 99°. These are the angles of this scan, unless the PandABox writes the file again."
-        in " ".join(told.before)
+        "panda.h5 has 12 rows, with angles 0° to 99°. The scan gets these angles, unless the PandABox writes the "
+        "file again." in " ".join(told.before)
     )
     assert isinstance(told.error, LedgerError) and "8 of 20 projections are missing: 12-19" in str(told.error)
     assert "8 frames arrived (13-20) but could not be used: the angle is not known" in str(told.error)
@@ -152,5 +152,7 @@ def test_a_frame_of_no_pixels_is_refused(tmp_path: Path) -> None:
     value.dimension = [{"size": n, "offset": 0, "fullSize": n, "binning": 1, "reverse": False} for n in (0, 16)]
     with FakeIoc() as ioc:
         told = ride_along(config_of(tmp_path, ioc.url, PLAN), tmp_path, lambda stop: ioc.post(value))
-    assert isinstance(told.error, ConfigError) and "not match the dimensions, 16 x 0 uint16" in str(told.error)
+    assert isinstance(told.error, ConfigError) and "the size of the frame is wrong: 16 x 0 pixels of uint16" in str(
+        told.error
+    )
     assert not stored(tmp_path)

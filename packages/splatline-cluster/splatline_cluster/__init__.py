@@ -84,7 +84,7 @@ class Cluster:
             alone = 0.0 if _count(self.client) else alone + look
             if alone >= self.patience:
                 raise WorkersLostError(
-                    f"Start workers again and continue with --resume: all workers have left, and none came for "
+                    "Start workers again and continue with --resume: all workers have left, and no worker came for "
                     f"{self.patience:g} s. Finished slabs are kept."
                 )
 
@@ -135,14 +135,15 @@ def connected(spec: str, first_worker_s: float = _CONNECT_TIMEOUT) -> Iterator[C
             client = closing.enter_context(Client(address, timeout=_CONNECT_TIMEOUT, set_as_default=False))
         except (OSError, RuntimeError, ValueError) as error:
             raise ConfigError(
-                f"--cluster {spec}: no scheduler answers ({' '.join(str(error).split())}). Nothing was read."
+                f"Check the address --cluster {spec}, and whether the scheduler runs: no scheduler answers "
+                f"({' '.join(str(error).split())}). Nothing was read."
             ) from error
         try:
             client.wait_for_workers(1, first_worker_s)
         except TimeoutError:
             raise ConfigError(
-                f"Start workers with dask worker {spec}: the scheduler of --cluster has none, and none came in "
-                f"{first_worker_s:g} s."
+                f"Start workers with dask worker {spec}: the scheduler of --cluster has no workers, and no worker "
+                f"came in {first_worker_s:g} s."
             ) from None
         _require_same_version(client, spec)
         yield Cluster(max(1, _count(client)), client)

@@ -86,7 +86,8 @@ def simulate(
 @click.option("-o", "--output", metavar="PATH", callback=parsed(volume_path), required=True,
               help="File for the activity; its suffix chooses the format.")  # fmt: skip
 @click.option("-m", "--method", default="osem", show_default=True,
-              help="mlem, osem, or any method of `beamline recon`, such as pnp-dct (smallest error).")  # fmt: skip
+              help="mlem, osem, or any method of `beamline recon`, such as pnp-dct (smallest error in our "
+              "test).")  # fmt: skip
 @click.option(
     "--iterations", type=click.IntRange(1), help="Iterations of mlem and osem. Default: chosen with held-out counts."
 )

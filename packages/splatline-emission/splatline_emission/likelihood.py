@@ -93,8 +93,9 @@ def _passes(emission: Emission, grid: Grid, subsets: int) -> Iterator[_Pass]:
             mean = survival * projector.forward(x) + emission.background[view_numbers]
             if blind := np.count_nonzero(counts[mean <= 0]):
                 raise ValueError(
-                    f"{blind} lines have counts although their mean is 0: they miss the grid, or their survival is 0. "
-                    "Use a larger grid, state a background for these lines, or set their counts to 0"
+                    f"{blind} lines of response have counts, although the model expects 0 counts: the lines miss "
+                    "the grid, or their survival is 0. Use a larger grid, state a background for these lines, or "
+                    "set their counts to 0"
                 )
             ratio = np.divide(counts, mean, out=np.zeros_like(mean), where=mean > 0)
             likelihood += float(np.sum(xlogy(counts, mean) - mean, dtype=np.float64))

@@ -104,8 +104,10 @@ def voxelise(volume: Path, output: Path, voxel: float | None, box: Box | None, a
 @volume_argument
 @click.option("-o", "--output", metavar="PATH.h5", type=_NEW, required=True, help="File to write.")
 @click.option("--angles", metavar="FIRST:END:STEP|A,B,...", callback=parsed(angles_of),
-              help="Angles of the projections in degrees, without END. Default: the angles of the fitted "
-              "projections.")  # fmt: skip
+              help=(
+                  "Angles of the projections in degrees; END itself is not one of them. Default: the angles of the "
+                  "fitted projections."
+              ))  # fmt: skip
 @json_option
 def render(volume: Path, output: Path, angles: NDArray[np.float64] | None, as_json: bool) -> None:
     """Project the Gaussians of a fit at any angles. Writes line integrals as a scan file in Data Exchange.

@@ -36,7 +36,7 @@ def box_grid(grid: Grid, voxel: float | None, box: tuple[tuple[float, float], ..
         box = ((z0, z1), (y0, y1), (x0, x1))
     nz, ny, nx = (round((high - low) / edge) for low, high in box)
     if min(nz, ny, nx) < 1:
-        raise ValueError(f"the box {box} is smaller than a voxel of {edge:g}")
+        raise ValueError(f"the box {box} (z, y, x) is smaller than a voxel, whose edge is {edge:g} in the same unit")
     z, y, x = ((low + high) / 2 for low, high in box)
     return Grid((nz, ny, nx), edge, (z, y, x))
 

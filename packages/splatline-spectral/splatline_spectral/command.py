@@ -69,8 +69,10 @@ def charges_of(ctx: click.Context, param: click.Parameter, value: str | None) ->
 @click.option("--states", "charges", metavar="CHARGE,...", callback=charges_of,
               help="Simulate the scene once for each of these states of charge of the material, 0 to 1.")  # fmt: skip
 @click.option("--region", "regions", multiple=True, callback=lambda ctx, param, values: tuple(map(box, values)),
-              metavar=_BOX, help="Region of the frames in which the material is visible, for a file. Default: the "
-              "whole frame.")  # fmt: skip
+              metavar=_BOX, help=(
+                  "If SOURCE is a file: region of its frames in which the material is visible. Default: the whole "
+                  "frame."
+              ))  # fmt: skip
 @click.option("--around", callback=lambda ctx, param, value: None if value is None else box(value), metavar=_BOX,
               help="Region around the material, to compare with. Default: no comparison.")  # fmt: skip
 @click.option("--unit", type=click.Choice(["keV", "eV"]),

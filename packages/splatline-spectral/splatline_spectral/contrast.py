@@ -234,7 +234,7 @@ def find_edge(energies: Reals, absorption: Reals) -> AbsorptionEdge:
         ValueError: fewer than nine energies, or energies that do not rise.
     """
     if energies.size < LEAST or not (np.diff(energies) > 0).all():
-        raise ValueError(f"an edge needs at least {LEAST} rising energies, got {energies.size}")
+        raise ValueError(f"to find an edge, at least {LEAST} energies in rising order are needed; got {energies.size}")
     noise = _noise(absorption)
     basis = np.linalg.qr(_victoreen(energies))[0]
     rest = absorption - basis @ (basis.T @ absorption)

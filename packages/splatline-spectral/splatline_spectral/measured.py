@@ -210,6 +210,6 @@ def _in_kev(path: Path, values: Reals, unit: str | None) -> Reals:
     if not ((energies >= _KEV_BELOW) & (energies <= _EV_BEYOND)).all():
         raise DataError(
             f"{path}: energies from {energies.min():g} to {energies.max():g} keV are impossible; expected "
-            f"{_KEV_BELOW:g} to {_EV_BEYOND:g}. Give the unit of the file with --unit. Nothing was written."
+            f"{_KEV_BELOW:g} to {_EV_BEYOND:g} keV. Give the unit of the file with --unit. Nothing was written."
         )
     return energies

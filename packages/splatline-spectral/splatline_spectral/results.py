@@ -64,9 +64,13 @@ def _lines(result: XafsResult, first: float | None) -> Iterator[str]:
         yield f"white line  {top}"
         yield f"in tables   {nearest_edges(edge.energy, result.elements)}"
     cnr, (low, high) = curve.contrast_to_noise, curve.nearly_best
-    what = "absorption" if cnr is None else f"contrast-to-noise of a pixel at this thickness, {cnr[curve.best]:.3g}"
+    what = (
+        "absorption"
+        if cnr is None
+        else f"contrast-to-noise ratio of a pixel at the measured thickness, {cnr[curve.best]:.3g}"
+    )
     best = f"{curve.energies[curve.best]:.4f} keV: highest {what}"
-    yield f"best        {best} (at least 95 % of it from {low:.4f} to {high:.4f} keV)"
+    yield f"best        {best} (at least 95 % of the highest value from {low:.4f} to {high:.4f} keV)"
 
 
 def nearest_edges(energy: float, elements: Sequence[int] = ()) -> str:

@@ -137,8 +137,8 @@ def _chosen(sample: Mixture, wanted: str | None) -> str:
         return charged[0]
     if wanted not in present:
         raise ConfigError(
-            f"--material {wanted or 'is not given'}: choose one of {', '.join(present)} ({len(charged)} of them have a "
-            "state_of_charge). Nothing was simulated."
+            f"--material {wanted or 'is not given'}: choose one of the materials {', '.join(present)} "
+            f"({len(charged)} of these materials have a state_of_charge). Nothing was simulated."
         )
     return str(wanted)
 
@@ -161,7 +161,7 @@ def _regions(sample: Mixture, material: str, scan: Scan) -> ContrastRegions:
     mine = np.array([c.material is not None and c.material.name == material for c in sample.constituents])
     own = thickness[mine].sum(axis=0)
     if not own.max() > 0:
-        raise ValueError("it is not in the field of view")
+        raise ValueError("the material is not in the field of view")
     inside = own >= _THICK * own.max()
     near = binary_dilation(own > 0, iterations=min(_NEAR, max(own.shape))) & (own == 0)
     with_material = near & (thickness != 0).any(axis=0)

@@ -119,7 +119,7 @@ def test_a_beam_too_bright_for_the_sensor_tells_nothing(tmp_path: Path) -> None:
         ({}, "Cu", "--material Cu: choose one of electrolyte, NMC811"),
         ({"beam": {"photons_per_s": 1}}, None, "materials need the beam's energy"),
         ({"detector": {"shape": [4, 4], "pixel_size_um": 0.1}, "axis_offset_px": 3000.0}, None,
-         "NMC811 cannot be compared with its surroundings: it is not in the field of view"),
+         "NMC811 cannot be compared with its surroundings: the material is not in the field of view"),
     ],
 )  # fmt: skip
 def test_scenes_that_cannot_be_scanned_are_refused(

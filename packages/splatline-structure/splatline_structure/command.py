@@ -27,8 +27,10 @@ _FILE = click.Path(path_type=Path)
 @click.option(
     "--states",
     is_flag=True,
-    help="Measure the particles of the first file, the volume of a careful scan, in all others, which are scans of "
-    "later states with few projections. No volume of a state is needed.",
+    help=(
+        "Measure particles in later states of a sample. The first file is the reference: the volume of a scan with "
+        "many projections. All other files are scans of later states with few projections, not volumes."
+    ),
 )
 @click.option(
     "--charge",
@@ -42,7 +44,7 @@ _FILE = click.Path(path_type=Path)
     help="Array to read from an HDF5 file or .npz. Default: where `beamline recon` writes the volume.",
 )
 @click.option("--voxel-um", metavar="EDGE|Z:Y:X", callback=parsed(edges_of),
-              help="Edge of a voxel in µm, or its three edges. Default: as the file states.")  # fmt: skip
+              help="Edge of a voxel in µm, or the three edges of a voxel. Default: as the file states.")  # fmt: skip
 @click.option(
     "--materials",
     type=click.IntRange(2, 6),
@@ -71,8 +73,10 @@ _FILE = click.Path(path_type=Path)
 @click.option(
     "--scan",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="Scan from which the volume was made. The command reconstructs it again from each half of the projections. "
-    "Default: the scan that the volume names.",
+    help=(
+        "Scan from which the volume was made. The command reconstructs the scan again from each half of the "
+        "projections. Default: the scan that the volume names."
+    ),
 )
 @click.option(
     "--quick",
@@ -85,8 +89,10 @@ _FILE = click.Path(path_type=Path)
     type=click.Choice(["square", "finite", "none"]),
     default="square",
     show_default=True,
-    help="Part of a slice to measure. square: the square inside the sample or the field of view, without "
-    "a can's wall. finite: the square inside the circle of finite voxels. none: everything.",
+    help=(
+        "Part of a slice to measure. square: the largest square inside the sample or the field of view, without the "
+        "wall of a can. finite: the largest square inside the circle of finite voxels. none: the whole slice."
+    ),
 )
 @click.option(
     "--memory",
@@ -236,7 +242,7 @@ def _write(measured_volumes: list[Seen], compare: bool, output: Path, values: di
             shown.insert(0, Picture("Numbers of all volumes", "Each value with its interval.", drawn))
     particles = first.found.structure.particles
     undecided = (
-        f"{first.found.undecided:.1%} of the voxels could be of either material; "
+        f"{first.found.undecided:.1%} of the voxels could be of either material. The box contains "
         f"{count(particles.label.size, 'particle')}, of which {int(particles.cut.sum())} touch a face of the box."
     )
     limits = [f"{first.path}: {first.read.limit_sentence}"] if first.read.limit_sentence else []

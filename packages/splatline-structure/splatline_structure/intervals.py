@@ -48,7 +48,7 @@ CAUSES = {
     "particles": "more whole particles (a larger field of view) would narrow the interval",
 }
 _NO_CAUSE = (
-    "no source of error changes this number, so the interval has the smallest width that is given "
+    "no source of error changes the number, so the interval has the smallest width that the command gives "
     f"({100 * NARROWEST:g} % to each side)"
 )
 _SHARES = "fraction", "sphericity", "cracks", "connected"
@@ -219,8 +219,10 @@ def _interval(
     if not all(map(math.isfinite, (*halves, *sides, wide))):
         return Interval(
             value,
-            why_not="whether this number exists depends on the threshold, on the number of projections or on "
-            "the voxel size",
+            why_not=(
+                "the number can be computed only with some of the thresholds, halves of the projections or voxel "
+                "sizes that were tried"
+            ),
         )
     still, of_voxels = OF_KIND.get(kind, OTHERS) if cubes else (OF_KIND.get(kind, OTHERS)[0], OTHERS[1])
     change = value - float(np.mean(halves)) if halves else math.nan

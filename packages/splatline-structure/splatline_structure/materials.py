@@ -92,9 +92,10 @@ def materials_of(volume: F32, count: int, seed: int = 0) -> Materials:
     if valleys.max() > MOST_BETWEEN:
         worst = int(valleys.argmax())
         raise ValueError(
-            f"materials {worst + 1} and {worst + 2} of {count} have no contrast: their levels are {levels[worst]:.4g} "
-            f"and {levels[worst + 1]:.4g}, and {valleys[worst]:.2g} times as many voxels are half-way between the "
-            "levels as near the rarer level"
+            f"materials {worst + 1} and {worst + 2} of {count} have no contrast: their grey levels are "
+            f"{levels[worst]:.4g} and {levels[worst + 1]:.4g}, but {valleys[worst]:.2g} times as many voxels have "
+            "values half-way between the two grey levels as values near the rarer grey level (at most "
+            f"{MOST_BETWEEN:g} times is allowed)"
         )
     return Materials(levels, spread, spread * np.array([math.sqrt(8 / core.size) for core in cores]))
 

@@ -34,8 +34,8 @@ def edges_of(text: str) -> Spacing:
         z = y = x = math.nan
     if not all(0 < edge < math.inf for edge in (z, y, x)) or not math.isclose(y, x, rel_tol=1e-3):
         raise ValueError(
-            f"{text!r}: expected the edge of a voxel in µm, such as 0.65, or Z:Y:X, such as 3:1:1, with Y equal to X "
-            "because the pixels of a slice must be squares"
+            f"{text!r}: expected the edge of a voxel in µm, such as 0.65, or the three edges Z:Y:X, such as 3:1:1. "
+            "Y must be equal to X, because the pixels of a slice must be squares"
         )
     return z, y, x
 

@@ -18,7 +18,11 @@ from splatline_structure.volumes import ReadSlices
 
 def pictures_of(measured: MeasuredStructure, volume: F32, grid: Grid, read: ReadSlices) -> list[Picture]:
     """All pictures of a page; the picture of sizes only if a particle is whole."""
-    band = " The band spans the curves from all projections and from each half." if measured.parts else ""
+    band = (
+        " The band spans three curves: from all projections, and from each half of the projections."
+        if measured.parts
+        else ""
+    )
     shown = [
         Picture(
             "Materials",
@@ -30,9 +34,9 @@ def pictures_of(measured: MeasuredStructure, volume: F32, grid: Grid, read: Read
         shown.append(
             Picture(
                 "Sizes",
-                "Of the total volume of the particles: the fraction in particles up to each diameter. Particles that "
-                "the edge of the box cuts are left out. Horizontal lines: the intervals of the diameters at 10, 50 and "
-                f"90 % of the volume.{band}",
+                "Fraction of the total volume of the particles that is in particles up to each diameter. Particles "
+                "that the edge of the box cuts are left out. Horizontal lines show the intervals of the diameters "
+                f"at 10, 50 and 90 % of the volume.{band}",
                 sizes(measured),
             )
         )
@@ -40,8 +44,8 @@ def pictures_of(measured: MeasuredStructure, volume: F32, grid: Grid, read: Read
         *shown,
         Picture(
             "Profiles",
-            "Fraction of the particles' material in each slice, and at each distance from the middle."
-            f"{' Grey: all slices.' if read.limit_sentence else ''}{band}",
+            "Fraction of the particles' material in each slice, and at each distance from the "
+            f"middle.{' Grey lines: all slices.' if read.limit_sentence else ''}{band}",
             profiles(measured, grid, read),
         ),
         Picture(

@@ -31,16 +31,21 @@ def pictures_of(reference: ReferenceParticles, states: Sequence[MeasuredState], 
     return [
         Picture(
             "Particles against the states",
-            "Thin: single particles, with the interval of one of them. Thick: the median, with a band from 10 % to "
-            "90 % of the particles. Below: how many particles are cracked, closed or gone.",
+            "Thin lines show single particles; one of these particles also has its interval. The thick line is the "
+            "median, and the band spans 10 % to 90 % of the particles. The lower graph shows how many particles are "
+            "cracked, closed or gone.",
             curves(series, verdicts, positions, across),
         ),
         Picture(
-            "Distribution over the particles", "Share of the particles below a value, for each state.",
+            "Distribution over the particles",
+            "For each state, the share of the particles whose number is below the value on the axis.",
             distributions(series, [state.path.name for state in states]),
         ),
         Picture(
-            "The last state", "The middle slice of the reference. Red: cracked; green: a crack closed; blue: gone.",
+            "The last state", (
+                "The middle slice of the reference. Cracked particles are red, particles whose crack closed are "
+                "green, and particles that are gone are blue."
+            ),
             map_of(reference, states[-1]),
         ),
     ]  # fmt: skip

@@ -137,7 +137,10 @@ def _volume(path: Path, values: dict[str, Any]) -> tuple[Any, F32]:
             )
         grid = record.grid
         if not math.isclose(grid.spacing[0], grid.voxel_size, rel_tol=_PITCH):
-            raise DataError(f"The voxels of {path} are no cubes, and cubes are expected. Nothing was written.")
+            raise DataError(
+                f"The voxels of {path} must be cubes: reconstruct the reference with a slice height equal to the "
+                "voxel width. Nothing was written."
+            )
         needed = BYTES_A_VOXEL * math.prod(grid.shape)
         if needed > values["memory"]:
             shape = " x ".join(map(str, grid.shape))
@@ -194,9 +197,9 @@ def _first_time(path: Path, record: Any, values: dict[str, Any]) -> float:
         pixel = source.pixel_size_mm
         if pixel is not None and not math.isclose(pixel * side, record.grid.voxel_size, rel_tol=_PITCH):
             raise DataError(
-                f"{path} has pixels of {1e3 * pixel * side:.4g} µm (binned {side} times), and the reference voxels of "
-                f"{1e3 * record.grid.voxel_size:.4g} µm. Reconstruct the reference with voxels as wide as the pixels. "
-                "Nothing was written."
+                f"Reconstruct the reference with voxels as wide as the pixels of the states: {path} has pixels of "
+                f"{1e3 * pixel * side:.4g} µm (binned {side} times), but the reference has voxels of "
+                f"{1e3 * record.grid.voxel_size:.4g} µm. Nothing was written."
             )
         times = source.table.times
         return math.nan if times is None else float(np.nanmin(times[source.table.views]))
@@ -250,10 +253,10 @@ def _write(series: Series, output: Path, values: dict[str, Any], answer: Answer)
                "10 % to 90 %", "volume change (%), median", "10 % to 90 %"]  # fmt: skip
     summary = [_summary(state) for state in states]
     sentences = [
-        f"{count(len(reference.bodies), 'particle')} of the reference, of which {int(reference.cut.sum())} touch the "
-        "lowest or the highest slice. Medians and shares leave these out.",
-        "Each interval should contain the true number in 80 % of all cases. The errors of the reference itself are not "
-        "in it.",
+        f"The reference has {count(len(reference.bodies), 'particle')}, of which {int(reference.cut.sum())} touch "
+        "the lowest or the highest slice. Medians and shares leave out particles that touch these slices.",
+        "Each interval should contain the true number in 80 % of all cases. The intervals do not include the errors "
+        "of the reference itself.",
     ]
     cut = reference.cut
     cells = [_cells(state, cut) for state in states]

@@ -42,7 +42,10 @@ def numbers_of_views(text: str) -> list[int]:
     multiple=True,
     default=("fraction_2", "size_50", "surface", "tortuosity_z"),
     show_default=True,
-    help="Number to follow, or all of a kind (tortuosity); may be given several times.",
+    help=(
+        "Name of a number to compare, or of a kind of numbers (tortuosity: all three directions). You may give "
+        "--number several times."
+    ),
 )
 @click.option("-m", "--method", default="fista-tv", show_default=True, help="Method of the reconstructions.")
 @click.option("--materials", type=click.IntRange(2, 6), default=2, show_default=True, help="Number of materials.")
@@ -93,7 +96,7 @@ def study_structure(
         known_of = {name: [each for each in known if f"{each}_".startswith(f"{name}_")] for name in names}
         if unknown := [name for name, each in known_of.items() if not each]:
             raise click.UsageError(
-                f"--number {unknown[0]}: expected a kind, such as tortuosity, or one of {', '.join(known)}."
+                f"--number {unknown[0]}: expected a kind of numbers, such as tortuosity, or one of {', '.join(known)}."
             )
         names = tuple(dict.fromkeys(chain(*known_of.values())))
         tell, series, axis_col, box = answer.counting("reconstructing with fewer projections"), {}, None, None
@@ -117,7 +120,13 @@ def study_structure(
                 ) from error
         rows = [[str(n), *results.cells(name, series[n][name])] for n in views for name in names]
         curves = pictures.curves_of({name: [series[n][name] for n in views] for name in names}, views, "projections")
-        shown = [Picture("Numbers against projections", "Each value with its interval; a gap: not determined.", curves)]
+        shown = [
+            Picture(
+                "Numbers against projections",
+                "Each number with its interval. A gap in a curve means that the number could not be determined.",
+                curves,
+            )
+        ]
         table = {f"{row[1]}, {row[0]} projections": series[int(row[0])][row[1]] for row in rows}
         page = results.page(
             f"Structure of {scan.name} against the number of projections", method, [], shown, table, {"scan": scan}

@@ -107,8 +107,8 @@ def read_volume(
         if voxel_um is not None:
             if record.length_unit == "mm" and not np.allclose(voxel_um, stated := 1e3 * np.array(grid.spacing), 0.01):
                 warn(
-                    f"{path} states voxels with edges of {_edges(stated)} µm (z x y x x). The edges of --voxel-um "
-                    f"are used instead: {_edges(voxel_um)} µm. Leave --voxel-um out to use those of the file."
+                    f"{path} states voxels with edges (z, y, x) of {_edges(stated)} µm, but the edges of --voxel-um "
+                    f"are used: {_edges(voxel_um)} µm. Leave out --voxel-um to use the edges that the file states."
                 )
             grid = Grid(grid.shape, voxel_um[2] * 1e-3, slice_pitch=voxel_um[0] * 1e-3)
         n_slices = grid.shape[0]
@@ -199,7 +199,7 @@ def box_in(volume: F32, crop: Crop) -> Box:
     if crop == "finite" and not known.all():
         box = inscribed_box((nz, ny, nx), sample_circle(known[None].astype(np.float32)), 0.0)
         if not known[box[1:]].all():
-            raise ValueError("some of its values are not finite, and not all of these are outside a circle")
+            raise ValueError("the volume has values that are not finite, and not only outside a circle")
         return box
     y, x = (np.arange(n) - (n - 1) / 2 for n in (ny, nx))
     away, field = np.hypot(y[:, None], x), min(ny, nx) / 2
@@ -297,9 +297,8 @@ def parts_of(
             slices = slice(slices.start - low, slices.stop - low)
         elif read.limit_sentence:
             raise ValueError(
-                "give --quick or --parts, because halves of cone-beam projections must be reconstructed whole, and do "
-                "not fit "
-                "the memory"
+                "give --quick or --parts, because volumes from halves of cone-beam projections must be "
+                "reconstructed with all slices, and do not fit the memory"
             )
         prepared = prepare_projections(picked, warn)
     views, geometry = prepared.views.seen, prepared.geometry

@@ -133,7 +133,9 @@ def test_a_number_that_is_not_there_is_refused_before_anything_is_reconstructed(
 ) -> None:
     monkeypatch.setattr(api, "reconstruct", None)
     result = beamline("study", "structure", "scan.h5", "--views", "16,64", "--number", "fraction_3")
-    words = "--number fraction_3: expected a kind, such as tortuosity, or one of fraction_1, fraction_2, surf"
+    words = (
+        "--number fraction_3: expected a kind of numbers, such as tortuosity, or one of fraction_1, fraction_2, surf"
+    )
     assert result.exit_code == 2 and words in result.stderr
     assert "tortuosity_x." in result.stderr and left(here) == {"scan.h5"}
 

@@ -45,7 +45,7 @@ def test_other_numbers_and_a_field_without_whole_particles_have_none_of_it() -> 
 
 def test_words_name_no_cause_where_none_moves_a_number() -> None:
     assert Interval(1, 0.999, 1, 0, views=0, levels=0, voxels=0, particles=0).words == (
-        "no source of error changes this number, so the interval has the smallest width that is given "
+        "no source of error changes the number, so the interval has the smallest width that the command gives "
         "(0.1 % to each side)"
     )
     assert (

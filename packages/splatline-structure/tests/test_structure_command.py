@@ -158,7 +158,7 @@ def test_without_contrast_in_the_middle_these_slices_are_named(here: Path) -> No
     np.save(here / "can.npy", volume)
     common = ("structure", "can.npy", *VOXEL_UM, "--quick", "--crop", "none", "--memory", "16M")
     result = beamline(*common)
-    words = "the rarer level; only slices 14:26 fit into the memory and were measured: give more --memory, or"
+    words = "is allowed); only slices 14:26 fit into the memory and were measured: give more --memory, or"
     assert result.exit_code == 5 and words in result.stderr
     assert "views" not in result.stderr and "--materials" not in result.stderr
     assert "--slices, or give fewer --materials. Nothing" in beamline(*common, "--materials", "3").stderr
@@ -253,7 +253,11 @@ print(peaks[1] - peaks[0])
 
 REFUSED = [
     (("even.npy", *VOXEL_UM), 5, "even.npy cannot be measured"),
-    (("noise.npy", *VOXEL_UM), 5, "near the rarer level; reconstruct from more projections. Nothing"),
+    (
+        ("noise.npy", *VOXEL_UM),
+        5,
+        "near the rarer grey level (at most 1.5 times is allowed); reconstruct from more projections. Nothing",
+    ),
     (("can.npy",), 5, "does not state the voxel size. Nothing was written"),
     (("can.npy", "--voxel-um", "nan"), 2, "expected the edge of a voxel in µm"),
     (("can.npy", "--voxel-um", "3:2:1"), 2, "pixels of a slice must be squares"),
@@ -314,7 +318,7 @@ def test_labels_edges_and_options_are_said_back(here: Path) -> None:
     words = ("structure", "three.npz", "--voxel-um", "10", "--quick", "--crop", "none", "--side", "1", "-o", "o")
     result = beamline(*words)
     assert result.exit_code == 0, result.output
-    assert "states voxels with edges of 30 x 10 x 10 µm" in result.stderr and "used instead: 10 x 10" in result.stderr
+    assert "states voxels with edges (z, y, x) of 30 x 10 x 10 µm" in result.stderr and "used: 10 x 10" in result.stderr
     assert "read as labels and not as grey values: 0 is material 1, 1 is material 2." in result.stderr
     settings = json.loads((here / "o/structure.json").read_text(encoding="utf-8"))
     assert " ".join(words) in json.dumps(settings)

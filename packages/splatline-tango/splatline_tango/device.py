@@ -128,8 +128,8 @@ def _sender(run: FollowedRun, verb: Verb) -> Callable[[Any], None]:
 
     send.__name__ = verb.value.capitalize()
     send.__doc__ = (
-        f"Same as `beamline {verb}`. This command returns at once; the state of the device shows when the "
-        f"scan has carried it out."
+        f"Same as `beamline {verb}`. The command returns at once; the state of the device shows when the scan has "
+        "carried out the command."
     )
     return send
 

@@ -116,7 +116,7 @@ class LearntGeometry:
         """The result as a sentence, with lengths in unbinned pixels."""
         changes = ", ".join(_text(self.change, term, binning) for term in self.confirmed)
         if not (self.confirmed or self.dropped):
-            return "Geometry: unchanged, because the projections show no error that matters."
+            return "Geometry: unchanged, because the projections show no significant error of the geometry."
         unchanged = f"{', '.join(self.dropped)}: unchanged, because held-out projections do not confirm a change."
         if not changes:
             return f"Geometry: {unchanged}"

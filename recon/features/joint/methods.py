@@ -150,6 +150,6 @@ def _because(still: float, moved: float, moves: bool) -> str:
     if moves or moved >= still:
         return f"{'motion' if moves else 'no motion'}, because {judged}"
     return (
-        "if the sample moved, make a second volume with --moves and compare the two. This volume has no motion, "
-        f"because the lower residual with motion may be chance: {judged}"
+        "if the sample moved, make a second volume with --moves, and compare it with this volume. This volume has "
+        f"no motion, because the lower residual with motion may be chance: {judged}"
     )

@@ -193,9 +193,9 @@ def _refuse_gaps(times: F64, knots: F64) -> None:
     if near.min() < _LEAST_NEAR:
         k = int(near.argmin())
         raise ValueError(
-            f"too few projections near volume {k + 1} of {knots.size} (at time {knots[k]:g}): {near[k]} within "
-            f"{np.diff(knots)[0] / 2:g}, and at least {_LEAST_NEAR} are needed. Ask for fewer volumes, or reconstruct "
-            "the projections before and after a gap separately"
+            f"too few projections near volume {k + 1} of {knots.size} (at time {knots[k]:g}): {near[k]} projections "
+            f"are closer to this time than {np.diff(knots)[0] / 2:g}, but at least {_LEAST_NEAR} are needed. Ask "
+            "for fewer volumes, or reconstruct the projections before and after a gap separately"
         )
 
 

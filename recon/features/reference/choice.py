@@ -129,7 +129,7 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     """
     problem, mu = trial.problem, trial.weight
     if problem.projector.geometry.is_cone:
-        return ReferenceVerdict(False, "a reference is used only with a parallel beam, and this is a cone")
+        return ReferenceVerdict(False, "a reference is used only with a parallel beam, and this scan has a cone beam")
     reference = _at_rows(reference, trial)
     moved = _in_rows(reference, problem)
     if mu is None:
@@ -162,10 +162,16 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     for name, residuals in others:
         told += f"; with {name} {residuals.mean():#.4g}"
         if not significantly_better(own, residuals, LEAST_GAIN):
-            return ReferenceVerdict(False, f"it does not predict held-out projections better than {name} ({told})")
+            return ReferenceVerdict(
+                False, f"the reference does not predict held-out projections better than {name} ({told})"
+            )
     if (where := _better_displaced(trial, fit)) is not None:
         return ReferenceVerdict(
-            False, f"it predicts held-out projections no better than a copy displaced by a voxel {where}"
+            False,
+            (
+                f"a copy of the reference that is displaced by a voxel {where} predicts held-out projections "
+                "equally well"
+            ),
         )
     all_views = best.strength * np.sqrt(ONE_IN / (ONE_IN - 1))
     of_scan = problem.units.prior(Prior(float(all_views)), problem.weight is not None, 1).weight

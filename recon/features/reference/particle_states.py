@@ -101,7 +101,7 @@ def reference_particles(volume: F32, labels: Numbers, grid: Grid) -> ReferencePa
     kept = np.flatnonzero((counts > 0) & (counts < _LARGEST * labels.size))
     kept = kept[kept > 0]
     if not kept.size:
-        raise ValueError("no particle was found in it; give --materials and --particles")
+        raise ValueError("no particle was found in the reference; give --materials and --particles")
     number = np.zeros(counts.size, np.int32)
     number[kept] = np.arange(1, kept.size + 1)
     own = np.ascontiguousarray(number[labels].transpose(1, 2, 0))

@@ -40,7 +40,9 @@ def require(device: str | torch.device) -> torch.device:
     if interpreted():
         return torch.device("cpu")
     if wanted.type != "cuda":
-        raise ValueError(f"the GPU kernels run on cuda devices, got {wanted}; use the CPU kernels for it")
+        raise ValueError(
+            f"the GPU kernels run only on cuda devices, got {wanted}; use the CPU kernels for device {wanted}"
+        )
     if not torch.cuda.is_available():
         raise RuntimeError(
             f"cannot use device {wanted}: torch {torch.__version__} finds no CUDA device. Check the driver and that "

@@ -32,11 +32,11 @@ FAULTS = {
     ),
     "unknown key": (
         ("exposure_s: 0.01", "exposure_s: 0.01\n  setle_s: 1"),
-        "my.yaml:5: scan.setle_s is not a known key (did you mean settle_s?); legal keys there: mode, angles",
+        "my.yaml:5: scan.setle_s is not a known key (did you mean settle_s?); legal keys in this section: mode, angles",
     ),
     "key of another scheme": (
         ("views: 12", "views: 12, seed: 1"),
-        "my.yaml:3: scan.angles.seed is not a known key; legal keys there: scheme, views, start_deg, span_deg",
+        "my.yaml:3: scan.angles.seed is not a known key; legal keys in this section: scheme, views, start_deg",
     ),
     "missing": (
         ("exposure_s: 0.01", "settle_s: 0"),
@@ -102,7 +102,7 @@ FAULTS = {
     ),
     "key of another stage": (
         ("counts_per_turn", "axis: 1, counts_per_turn"),
-        "my.yaml:7: devices.stage.axis is not a known key; legal keys there: kind, port",
+        "my.yaml:7: devices.stage.axis is not a known key; legal keys in this section: kind, port",
     ),
     "counterpart of another stage": (
         ("kind: pm16c", "kind: pi_gcs"),

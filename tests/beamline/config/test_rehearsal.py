@@ -145,5 +145,5 @@ def test_keys_of_a_real_camera_are_one_fault_that_names_the_way(tmp_path: Path) 
     with pytest.raises(ConfigError) as refused:
         load(path, environment={})
     said = str(refused.value)
-    assert said.startswith(f"{path}:{_line(path, 'library:')}: devices.camera: remove library, index, link, ")
-    assert "because this kind does not have these keys" in said and "--rehearse" in said and "\n" not in said
+    assert said.startswith(f"{path}:{_line(path, 'library:')}: devices.camera: remove the keys library, index, link, ")
+    assert "because they do not belong to the stated kind" in said and "--rehearse" in said and "\n" not in said

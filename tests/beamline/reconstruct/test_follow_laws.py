@@ -176,9 +176,9 @@ def test_the_law_of_a_scan_of_64_views(follow: Callable[..., Followed]) -> None:
     assert (none["n_views"], np.isnan(none["exponent"])) == (
         32,
         True,
-    ) and "3 frames of the open beam; got 32 and 5" in none["reason"]
+    ) and "3 frames of the open beam are needed; got 32 projections and 5 frames" in none["reason"]
     (warning,) = followed.of("warning")
-    assert "3 frames of the open beam; got 32 and 5" in warning["message"]
+    assert "3 frames of the open beam are needed; got 32 projections and 5 frames" in warning["message"]
     followed.seconds(32)
     _, law = followed.of("error_law")
     assert law["n_views"] == 64 and 0 < law["exponent"] < 1 and 0 <= law["noise"] <= 1 and law["offset"] == 0

@@ -259,7 +259,7 @@ def test_edges_along_the_wedge_are_blurred() -> None:
     views = Geometry.parallel(np.radians(np.arange(10, 130, 1.0)), (1, 96))
     u = np.arange(96) - 47.5
     disc = np.tile(2 * np.sqrt(np.clip(30**2 - u**2, 0, None)), (views.n_views, 1, 1)).astype(np.float32)
-    with pytest.warns(UserWarning, match="in 60 of 180 degrees there is no projection"):
+    with pytest.warns(UserWarning, match="because 60 of 180 degrees have no projection"):
         image = reconstruct(disc, views, "fbp").volume.data[0]
     (wedge,) = unseen_wedges(views)
 

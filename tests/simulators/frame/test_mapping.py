@@ -72,7 +72,10 @@ def test_a_number_is_finite(value: Any) -> None:
     ("mapping", "words"),
     [
         (3, f"outer is 3; expected a group of keys: {', '.join(field.name for field in fields(Outer))}"),
-        ({"reel": 1}, "outer.reel is not a known key (did you mean real?); legal keys there: real, whole, flag, "),
+        (
+            {"reel": 1},
+            "outer.reel is not a known key (did you mean real?); legal keys in this section: real, whole, flag, ",
+        ),
         ({"whole": 1.5}, "outer.whole is 1.5; expected a whole number"),
         ({"whole": "many"}, "outer.whole is 'many'; expected a whole number"),
         ({"text": 4680}, "outer.text is 4680; expected text"),
@@ -89,7 +92,10 @@ def test_a_number_is_finite(value: Any) -> None:
         ({"shares": {3: "x"}}, "outer.shares.3 is 'x'; expected a number"),
         ({"inner": 60}, "outer.inner is 60; expected a group of keys: kv, filters"),
         ({"inner": {}}, "outer.inner.kv is missing; expected a number"),
-        ({"inner": {"kv": 1, "volts": 1}}, "outer.inner.volts is not a known key; legal keys there: kv, filters"),
+        (
+            {"inner": {"kv": 1, "volts": 1}},
+            "outer.inner.volts is not a known key; legal keys in this section: kv, filters",
+        ),
         ({"inner": {"kv": 1, "filters": {"Al": None}}}, "outer.inner.filters.Al is null; expected a number"),
         ({"inner": {"kv": 1, "filters": {1: 1}}}, "outer.inner.filters.1: key must be a valid string"),
         ({"real": -1}, "outer: real must be >= 0, got -1.0"),

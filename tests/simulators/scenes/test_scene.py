@@ -79,7 +79,7 @@ def _with(**changes: Any) -> dict[str, Any]:
         ({}, "scene.phantom is missing; expected any value"),
         (
             _with(colour="red"),
-            "scene.colour is not a known key; legal keys there: phantom, beam, axis_offset_px, effects",
+            "scene.colour is not a known key; legal keys in this section: phantom, beam, axis_offset_px, effects",
         ),
         (
             _with(beam={"photons": 1}),
@@ -104,7 +104,7 @@ def _with(**changes: Any) -> dict[str, Any]:
         (_with(effects=["fog"]), "scene.effects[0]: kind 'fog' is unknown; legal: motion_blur, rolling_shutter, "),
         (
             _with(effects=["photon_noise", {"kind": "zingers", "rat": 1}]),
-            "scene.effects[1] (zingers).rat is not a known key (did you mean rate?); legal keys there: rate, charge",
+            "scene.effects[1] (zingers).rat is not a known key (did you mean rate?); legal keys in this section: rate",
         ),
         (
             _with(effects=["offset", "photon_noise"]),

@@ -79,7 +79,7 @@ def test_what_was_learnt_is_said_in_pixels_of_the_detector() -> None:
     assert (
         LearntGeometry(GeometryChange.none(2), (), (), 0.4, 0.4)
         .in_words()
-        .startswith("Geometry: unchanged, because the projections show no error")
+        .startswith("Geometry: unchanged, because the projections show no significant error")
     )
 
 

@@ -212,7 +212,10 @@ def test_a_stop_within_a_sweep_gives_volumes(asked: int) -> None:
 def test_a_gap_with_too_few_views_for_a_volume_is_refused() -> None:
     views = views_of(60)
     gap = replace(views, times=np.where(views.times < 3, views.times, views.times + 20))
-    with pytest.raises(ValueError, match=r"volume 2 of 4.*: 0 within 4.9.*, and at least 6 are needed"):
+    with pytest.raises(
+        ValueError,
+        match=r"volume 2 of 4.*: 0 projections are closer to this time than 4.9.*, but at least 6 are needed",
+    ):
         fit_series(gap, 4)
 
 

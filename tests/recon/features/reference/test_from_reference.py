@@ -75,7 +75,9 @@ def test_the_reference_of_another_sample_is_refused_to_the_bit(
     made = recon.reconstruct(*state, recon.FromReference(reference(packed(seed=9)), AUTO))
     np.testing.assert_array_equal(made.volume.data, without.volume.data)
     assert not made.settings["reference_used"] and made.change is None
-    assert made.chosen.startswith("The reference was not used: it does not predict held-out projections better than")
+    assert made.chosen.startswith(
+        "The reference was not used: the reference does not predict held-out projections better than"
+    )
     assert made.method == without.method
 
 
@@ -171,7 +173,10 @@ def test_in_a_cone_the_volume_is_that_of_auto(before: Volume, state: tuple[F32, 
     data, parallel = state
     cone = recon.Geometry.cone(parallel.angles, parallel.detector_shape, pixel_pitch=1.001, sod=1e5, sdd=1.001e5)
     made = recon.reconstruct(data, cone, recon.FromReference(before, AUTO))
-    assert made.settings["reference_because"] == "a reference is used only with a parallel beam, and this is a cone"
+    assert (
+        made.settings["reference_because"]
+        == "a reference is used only with a parallel beam, and this scan has a cone beam"
+    )
     np.testing.assert_array_equal(made.volume.data, recon.reconstruct(data, cone, AUTO).volume.data)
 
 
