@@ -96,8 +96,8 @@ def error_bars(
         )
     if geometry.n_views < LEAST_VIEWS:
         raise ValueError(
-            f"error bars need at least {LEAST_VIEWS} projections, because they compare two halves of them; got "
-            f"{geometry.n_views}"
+            f"error bars need at least {LEAST_VIEWS} projections, because error bars compare two halves of the "
+            f"projections; got {geometry.n_views}"
         )
     method = method_on_voxels(method, decided)
     factors = method.error_bars

@@ -277,7 +277,8 @@ def snr_cnr(volume: Array, mask: NDArray[np.int8] | NDArray[np.bool_]) -> tuple[
     dense, empty = (volume[mask == kind] for kind in (1, 0))
     if not dense.size or not empty.size:
         raise ValueError(
-            f"the mask marks {dense.size} dense and {empty.size} empty voxels; at least one of each is needed"
+            f"the mask marks {dense.size} dense and {empty.size} empty voxels; at least one dense and one empty "
+            "voxel are needed"
         )
     with np.errstate(invalid="ignore"):
         mean, base = (float(each.mean(dtype=np.float64)) for each in (dense, empty))

@@ -70,8 +70,8 @@ class Geometry:
         skew: angle in radians by which the stage turns from the readout of one row to the next (parallel beam only);
             `angles` are the angles of the first row.
         centres: float64 [view, 3], (x, y, z) in mm (cone beam only): the point that lies at the distance `sod` from the
-            source, along the beam of the projection. If `centres` is left out, the point is the origin in all
-            projections.
+            source, along the beam of the projection. If `centres` is left out, the origin lies at the distance `sod`
+            from the source in all projections.
     """
 
     angles: F64
@@ -328,7 +328,7 @@ class Geometry:
 
     def origin(self, view: int) -> tuple[float, float]:
         """Pixel (col, row) at which one projection shows the origin of the object's frame. If the geometry has
-        `centres`, the pixel at which the projection shows its own centre."""
+        `centres`, `origin` is the pixel at which the projection shows its own centre."""
         return self.axis_col + float(self.shifts[view, 0]), self.axis_row + float(self.shifts[view, 1])
 
     def __repr__(self) -> str:
@@ -355,7 +355,7 @@ class Geometry:
         """
         chosen = np.atleast_1d(np.arange(self.n_views)[views])
         if chosen.size == 0:
-            raise ValueError("no projections are selected; give at least one")
+            raise ValueError("no projections are selected; select at least one projection")
         some: dict[str, Any] = {name: frozen(getattr(self, name)[chosen]) for name in _OF_VIEWS}
         return replace(self, **some)
 

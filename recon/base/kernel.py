@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 class Kernel(StrEnum):
     """Profile f(q) of a Gaussian; q is the square of the distance from the centre in standard deviations, f(0) = 1.
 
-    The kernel `gaussian` is f(q) = exp(-q / 2). The kernel `compact:1.5` is f(q) = (1 - q / R²)₊^m with m = 3/2 and
-    R² = 2 m + 5. This radius R gives both kernels the same second moment, so a covariance describes the same width for
-    both kernels.
+    The kernel `gaussian` is f(q) = exp(-q / 2). The kernel `compact:1.5` is f(q) = (1 - q / R²)₊^m with m = 3/2 and R²
+    = 2 m + 5. The radius R gives the kernels `compact:1.5` and `gaussian` the same second moment, so a covariance
+    describes the same width for both kernels.
 
-    The line integral of the compact kernel has the same form with exponent m + 1/2, which is a polynomial for m = 3/2:
-    ∫ (1 - t² - s²)₊^m ds = √π Γ(m + 1) / Γ(m + 3/2) (1 - t²)₊^(m + 1/2). The compact kernel ends at a finite radius,
-    while a Gaussian kernel must be cut off. The projection of the compact kernel is steeper at its edge than that of a
-    Gaussian, and has no tail. The compact kernel suits samples with sharp edges.
+    The line integral of the compact kernel has the form of the kernel with exponent m + 1/2 instead of m, which is a
+    polynomial for m = 3/2: ∫ (1 - t² - s²)₊^m ds = √π Γ(m + 1) / Γ(m + 3/2) (1 - t²)₊^(m + 1/2). The compact kernel
+    ends at a finite radius, while a Gaussian kernel must be cut off. The projection of the compact kernel is steeper at
+    its edge than that of a Gaussian, and has no tail. The compact kernel suits samples with sharp edges.
     """
 
     GAUSSIAN = "gaussian"

@@ -61,8 +61,8 @@ class Grid:
         covers all heights.
 
         If the axis is off the detector's middle (`Geometry.is_off_middle`), the box contains the field of view of a
-        360° scan, as in `of_field`. A smaller box would not do, because material that projections see outside the box
-        would appear in the voxels of the box.
+        360° scan, as in `of_field`. With a smaller box, material that projections see outside the box would appear in
+        the voxels of the box.
         """
         check_arguments(cls.matching, locals())
         across, (down, middle) = _spread(geometry, 0)[0], _spread(geometry, 1)

@@ -109,7 +109,8 @@ def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tup
     explained = 1 - float(np.mean(solution.fun**2) / p.var())
     if explained < _LEAST_EXPLAINED:
         raise NoCurveError(
-            f"the sample seems to have several materials: its thickness explains only {max(explained, 0):.0%} of the "
-            f"variance of the line integrals, and for one material it explains at least {_LEAST_EXPLAINED:.0%}"
+            f"the sample seems to have several materials: its thickness explains only {max(explained, 0):.0%} of "
+            "the variance of the line integrals, and the thickness of a sample of one material explains at least "
+            f"{_LEAST_EXPLAINED:.0%}"
         )
     return curve_of_spectrum((hard + more, hard), (share, 1 - share), highest), explained

@@ -62,9 +62,9 @@ def correct(
 ) -> Projections:
     """Line integrals -log((counts - dark) / (flat - dark)) of a stack of projections.
 
-    All results are finite: dead pixels and single bad values get the mean of their good neighbours. The result says how
-    many values were replaced. `correct` needs memory for the result and for a few frames. Arguments and errors of
-    `correct` are those of `survey` and of `CorrectionPlan.transmission`.
+    All results are finite: dead pixels and single bad values get the mean of their good neighbours. The result contains
+    the mask of dead pixels, and the fraction of other values that were filled. `correct` needs memory for the result
+    and for a few frames. Arguments and errors of `correct` are those of `survey` and of `CorrectionPlan.transmission`.
     """
     counts = without_mask(counts)
     check_arguments(correct, locals())

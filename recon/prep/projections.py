@@ -22,7 +22,7 @@ class Projections:
         view_ids: int64 [view].
         floored: fraction of the values of live pixels that were raised to the lowest allowed transmission.
         air: float32 [view], mean transmission of the air columns in each projection. The projection was divided by this
-            transmission; it is 1 if there are no air columns.
+            transmission. `air` is 1 if there are no air columns.
         masked: bool [row, col], dead and hot pixels, filled from their neighbours in every projection.
         air_columns: (left, right) number of columns in which `air` was measured; (0, 0) if `air` was not measured.
         replaced: fraction of all values of live pixels that were zingers or not finite, and were filled from their

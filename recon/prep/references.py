@@ -75,7 +75,7 @@ def _mean(frames: Image, what: str, beam: float) -> Image:
 def check(references: References) -> None:
     """Raise ValueError if there are no flats, shapes disagree, or two groups of flats have the same position."""
     if not references.flats:
-        raise ValueError("counts cannot be converted to line integrals without a flat; give at least one")
+        raise ValueError("counts cannot be converted to line integrals without a flat; give at least one flat")
     shape = np.shape(references.dark)
     for position, flat in references.flats:
         if np.shape(flat) != shape or len(shape) != 2:

@@ -202,8 +202,8 @@ class FitSettings:
             gradient of total variation with respect to the centres is too small by the square of the voxel size, so it
             has no effect. The correct gradient of total variation raises the PSNR of the walnut by 0.2 dB (60
             projections) and that of the battery by 0.4 dB (90 projections).
-        rates: learning rates at the first step: of centres (in units of half the width of the field), log scales,
-            quaternions and raw densities.
+        rates: learning rates at the first step: of centres (in units of half the width of the field of view), log
+            scales, quaternions and raw densities.
         pace: factor on all published rates. The published rates are for 30 000 steps, and a fit of 1000 steps with them
             is far from convergence. With `pace` 20, two projections per step and a low last rate, a fit of 1000 steps
             gains 1 to 4 dB. With `pace` 26 and a higher last rate, 400 steps before the voxel refinement suffice for a

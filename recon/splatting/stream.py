@@ -46,7 +46,7 @@ class StreamingFit:
             projections see.
         gaussians: number of Gaussians at the start of the fit; None: derived from the detector (see `default_count`).
         settings: settings of the fit; `joined_pixels` can only be used in a fit of a finished scan.
-        first_views, first_span: the fit starts when this number of projections has arrived and they span this angle in
+        first_views, first_span: the fit starts when `first_views` projections have arrived and span `first_span`
             radians (modulo π).
 
     Raises:

@@ -49,7 +49,7 @@ class StreamPlan:
         if (self.settings.joined_pixels or 1) > 1:
             raise ValueError(
                 f"joined_pixels={self.settings.joined_pixels} works only in a fit of a finished scan. For a fit "
-                "during a scan, leave it out and bin the scan"
+                "during a scan, leave joined_pixels out and bin the scan"
             )
 
 

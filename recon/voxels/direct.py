@@ -143,8 +143,8 @@ def _by_slabs(
     if geometry.climbs:  # each voxel would lack the projections that do not see it
         raise ValueError(
             f"use an iterative method (fista-tv, sirt): the projections move by {np.ptp(geometry.shifts[:, 1]):.4g} "
-            f"of {geometry.detector_shape[0]} rows along the rotation axis. Direct methods support this only for a "
-            "parallel beam without roll and tilt"
+            f"of {geometry.detector_shape[0]} rows along the rotation axis. Direct methods support such movement "
+            "only for a parallel beam without roll and tilt"
         )
     if (reach := float(np.hypot(*np.abs(grid.edges[:, :2]).max(0)))) >= geometry.sod:
         raise ValueError(
@@ -340,8 +340,8 @@ class Fbp(Direct):
         return Reconstruction(Volume(data, problem.grid), {"filter": self.filter})
 
     def views_wanted(self, geometry: Geometry) -> NDArray[np.bool_]:
-        """True for all projections except laterally offset ones. Raises ValueError for a cone beam that FDK cannot
-        use.
+        """True for all projections except laterally offset ones. Raises ValueError for a cone scan that is too short
+        for FDK, or whose angles have several gaps.
         """
         if geometry.is_cone and missing_arc(geometry) > 0:
             cone_weights(geometry)  # the error says how many degrees are missing

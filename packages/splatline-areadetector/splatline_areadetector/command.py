@@ -40,16 +40,20 @@ def _print_example(ctx: click.Context, param: click.Parameter, value: bool) -> N
 @click.option("--check", "only_check", is_flag=True,
               help="Record nothing; show the settings of the IOC, and whether 2 s of frames are complete.")  # fmt: skip
 @click.option(
-    "--darks", metavar="FILE", help="Darks for a scan that takes none: a scan file, HDF5 (FILE::DATASET) or TIFF."
+    "--darks",
+    metavar="FILE",
+    help="File with darks, if the scan takes no darks: a scan file, HDF5 (FILE::DATASET) or TIFF.",
 )
 @click.option(
-    "--flats", metavar="FILE", help="Flats for a scan that takes none: a scan file, HDF5 (FILE::DATASET) or TIFF."
+    "--flats",
+    metavar="FILE",
+    help="File with flats, if the scan takes no flats: a scan file, HDF5 (FILE::DATASET) or TIFF.",
 )
 @click.option(
     "--reference", metavar="GOOD", type=click.Path(path_type=Path, exists=True),
     help=(
         "Volume of the same sample from an earlier scan with many projections, or the file of the earlier scan. The "
-        "live volume uses it as in `beamline scan`. The same as recon.reference in CONFIG."
+        "live volume uses the reference as in `beamline scan`. The option replaces recon.reference in CONFIG."
     ),
 )  # fmt: skip
 @click.option("--page", is_flag=True, help="Show the runs in the browser; all runs have the same address.")
@@ -57,7 +61,7 @@ def _print_example(ctx: click.Context, param: click.Parameter, value: bool) -> N
 @click.option(
     "--repeat",
     is_flag=True,
-    help="Record one scan after the other until Ctrl-C, even if frames are missing in some.",
+    help="Record one scan after the other until Ctrl-C, even if frames are missing in some scans.",
 )
 @click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False),
               help="Folder for the folders of runs. Default: storage.folder of CONFIG.")  # fmt: skip

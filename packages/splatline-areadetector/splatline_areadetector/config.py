@@ -182,7 +182,7 @@ class RideConfig(Section):
         angles = self.ride.angles
         if isinstance(angles, PlanAngles) and angles.views > 1 and not math.fabs(angles.step_deg) > 0:
             raise ValueError(
-                f"ride.angles.step_deg is {angles.step_deg:g}: {angles.views} views need a step that is not 0"
+                f"ride.angles.step_deg is {angles.step_deg:g}: {angles.views} projections need a step that is not 0"
             )
         if self.monitor.retake:
             raise ValueError(

@@ -171,8 +171,8 @@ def silence_sentence(counters: Counters) -> str:
         return f"{plugin.prefix}EnableCallbacks is Disable; set it to Enable"
     if camera is None:
         return (
-            "the camera waits for triggers, or does not acquire (if you set ride.camera, this message says which "
-            "of the two)"
+            "the camera waits for triggers, or does not acquire (set ride.camera, so that this message can say "
+            "whether the camera acquires)"
         )
     if camera.text("ArrayCallbacks_RBV") == "Disable":
         return f"{camera.prefix}ArrayCallbacks is Disable; set it to Enable"
@@ -207,8 +207,8 @@ def _refuse_port(wanted: str | None, counters: Counters) -> None:
         return
     if wanted is not None:
         raise ConfigError(
-            f"{counters.plugin.prefix}NDArrayPort is {port}, but ride.source is {wanted}: change one of them. "
-            f"{_SKIPPED}"
+            f"{counters.plugin.prefix}NDArrayPort is {port}, but ride.source is {wanted}: set both to the same "
+            f"port. {_SKIPPED}"
         )
     is_plugin = port.upper().startswith(_PLUGINS)
     if port.upper().startswith(_SAFE) or not (camera or is_plugin):
@@ -217,7 +217,8 @@ def _refuse_port(wanted: str | None, counters: Counters) -> None:
     raise ConfigError(
         f"{counters.plugin.prefix} sends the frames of {port}, not those of the "
         f"camera{f' {camera}' if camera else ''}: {what}. Set {counters.plugin.prefix}NDArrayPort to "
-        f"{camera or 'the port of the camera'}, or, if you want these frames, set ride.source: {port}. {_SKIPPED}"
+        f"{camera or 'the port of the camera'}, or, if you want the frames of {port}, set ride.source: {port}. "
+        f"{_SKIPPED}"
     )
 
 
@@ -233,6 +234,7 @@ def _refuse_binned(config: RideConfig, frame: ArrayFrame, counters: Counters) ->
     if across > 1 and by_camera != across and config.ride.source is None:
         who = "a plugin before" if camera is not None else "the camera or a plugin"
         raise ConfigError(
-            f"Frames are binned {across} x {across} by {who} {config.ride.image}. Take the frames before this plugin "
-            f"(NDArrayPort of the Pva plugin), or, if you want binned frames, set ride.source to that port. {_SKIPPED}"
+            f"Frames are binned {across} x {across} by {who} {config.ride.image}. Take unbinned frames (set "
+            "NDArrayPort of the Pva plugin to a port before the binning), or, if you want binned frames, set "
+            f"ride.source to the port of the binned frames. {_SKIPPED}"
         )

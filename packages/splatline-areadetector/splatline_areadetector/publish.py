@@ -44,7 +44,10 @@ def _prefix(ctx: click.Context, param: click.Parameter, value: str) -> str:
     help="Network address on which clients may connect; 0.0.0.0: any.",
 )
 @click.option("--port", default=None, type=click.IntRange(0, 65535),
-              help="TCP port of the image. Default: that of EPICS or, if it is taken, any free one.")  # fmt: skip
+              help=(
+                  "TCP port of the image. Default: the port of EPICS, or any free port if another program uses the "
+                  "port of EPICS."
+              ))  # fmt: skip
 @click.option("--files", default=None, type=click.Path(path_type=Path, file_okay=False, exists=True), metavar="FOLDER",
               help="Let clients request that frames are written to files below this folder. "
                    "Default: no files.")  # fmt: skip

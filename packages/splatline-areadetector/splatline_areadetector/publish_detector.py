@@ -169,7 +169,8 @@ class PublishedDetector:
             if name in self._fixed:
                 if name == "cam1:AcquireTime" and self._exposure and not np.isclose(float(value), self._exposure):
                     self._say_once(
-                        f"A client asked for an exposure of {value:g} s. The scan keeps its own, {self._exposure:g} s."
+                        f"A client asked for an exposure of {value:g} s. The scan keeps its exposure of "
+                        f"{self._exposure:g} s."
                     )
                 return
             self._set[name] = value
@@ -302,8 +303,8 @@ class PublishedDetector:
         template = str(self._set["HDF1:FileTemplate"])
         if self._files is None:
             raise DataError(
-                f"Start `beamline publish` with --files FOLDER, so that it may write {folder}{name}; without --files "
-                "it writes no files."
+                f"Start `beamline publish` with --files FOLDER, so that the program may write {folder}{name}; "
+                "without --files the program writes no files."
             )
         if not self._allowed(Path(folder)):
             raise DataError(f"{folder} is not below the folder of --files, {self._files}.")

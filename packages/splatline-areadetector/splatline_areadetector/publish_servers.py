@@ -66,8 +66,8 @@ class ImageServer:
         if port not in (None, 0, self.port):
             self._server.stop()
             raise DataError(
-                f"Another program uses port {port} of {address}. Give another --port, or leave it out: clients find "
-                "the image by its name. Nothing was started."
+                f"Another program uses port {port} of {address}. Give another --port, or leave out --port: clients "
+                "find the image by its name. Nothing was started."
             )
         self._posted, self._frame_bytes = 0, 0
         self._clients: dict[str, tuple[int, int]] = {}  # frames posted before the client came, bytes sent to it by then

@@ -348,23 +348,25 @@ class RiddenFrames:
         angles, basis, n = self._plan.angles, self._sorter.basis, self._sorter.n_left
         if n == 0 or not self._views or basis.is_sure or (basis is Basis.WAITED and not ended):
             return ""
-        off = f"the true angle of each projection is the stated angle of the projection {n} places later"
+        wrong = f"the true angle of each projection is the stated angle of the projection {n} places later"
         if n < angles.size and not np.isnan(angles).any():
-            off = f"all angles are {math.degrees(angles[n] - angles[0]):.4g}° larger than stated"
+            wrong = f"all angles are {math.degrees(angles[n] - angles[0]):.4g}° larger than stated"
         has_angles = self._plan.angle_source == "attribute"
         if self._sorter.is_by_order and len(self._plan.blocks) > 1:
-            off = "" if has_angles else f", and {off}"
-            off = (
+            also = "" if has_angles else f", and {wrong}"
+            wrong, key = (
                 "the first and last frames of each block are stored as frames of the neighbouring block (dark, flat "
-                f"or projection){off}. Set ride.kinds"
+                f"or projection){also}",
+                "ride.kinds",
             )
         elif has_angles:
             return ""
         else:
-            off = f"{off}, which rotates the volume and changes nothing else. Set ride.camera"
+            wrong, key = f"{wrong}, which rotates the volume and changes nothing else", "ride.camera"
+        missing = "frame" if n == 1 else f"{n} frames"
         return (
-            f"The number of the first projection is not known, so the missing {'frame' if n == 1 else f'{n} frames'} "
-            f"may be the first of the scan. If so, {off} or ride.first_id to avoid this."
+            f"The number of the first projection is not known, so the missing {missing} may be the first of the scan. "
+            f"If so, {wrong}. Set {key} or ride.first_id to avoid wrong angles and kinds of frames."
         )
 
     def _raise_outcome(self) -> None:
@@ -393,8 +395,8 @@ class RiddenFrames:
     def _others(self) -> str:
         if not self._views:
             return f" The file has {count(self._row, 'frame')}, but no projection with an angle."
-        by = "" if self._sorter.basis.is_sure else f", counted from {self._sorter.basis.value}"
-        return f" Every other frame is in the file with the angle of its number{by}."
+        counted_from = "" if self._sorter.basis.is_sure else f", counted from {self._sorter.basis.value}"
+        return f" Every other frame is in the file with the angle of its number{counted_from}."
 
 
 def seen_of(frame: ArrayFrame, guide: Guide, *, gone: bool = False) -> Seen:

@@ -162,7 +162,7 @@ def test_a_client_sees_pixels_number_and_attributes(image: ImageServer) -> None:
 
 def test_a_port_that_is_taken_is_one_sentence(image: ImageServer, capfd: Any) -> None:
     with pytest.raises(
-        DataError, match=rf"uses port {image.port} of 127\.0\.0\.1\. .* another --port, or leave it out"
+        DataError, match=rf"uses port {image.port} of 127\.0\.0\.1\. .* another --port, or leave out --port"
     ):
         ImageServer("T:Pva1:Image", "127.0.0.1", image.port)
 
@@ -249,7 +249,7 @@ def test_a_scan_keeps_its_own_exposure_and_says_so_once() -> None:
     shown.ask(cam1_AcquireTime=0.01)
     shown.ask(cam1_AcquireTime=0.01)
     assert shown.values["cam1:AcquireTime_RBV"] == 0.05
-    assert shown.said == ["A client asked for an exposure of 0.01 s. The scan keeps its own, 0.05 s."]
+    assert shown.said == ["A client asked for an exposure of 0.01 s. The scan keeps its exposure of 0.05 s."]
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,7 @@ def _making(volume: Path, output: Path, as_json: bool) -> Iterator[tuple[Model, 
 @click.option(
     "--voxel",
     type=click.FloatRange(min=0, min_open=True),
-    help="Edge of a voxel in the unit of VOLUME (mm if the voxel size is known). Default: that of VOLUME.",
+    help="Edge of a voxel in the unit of VOLUME (mm if the voxel size is known). Default: the voxel edge of VOLUME.",
 )
 @click.option(
     "--box",

@@ -246,7 +246,7 @@ def find_edge(energies: Reals, absorption: Reals) -> AbsorptionEdge:
 
     stands_out = chance < FALSE_ALARM or misfit > SURE * noise
     if not stands_out or misfit <= SMOOTH * float(np.abs(absorption).mean()):
-        return none("within its noise the curve is as smooth as a curve without an edge")
+        return none("within the noise, the absorption curve is as smooth as a curve without an edge")
     _, slope = local_parabolas(energies, absorption, NARROW)
     first = max(step - max(NARROW, energies.size // 10), 0)
     steepest = first + int(np.argmax(slope[first : step + max(NARROW, energies.size // 10)]))

@@ -89,8 +89,10 @@ def read_spectra(path: Path) -> Spectra:
               help="Find and correct the motion of the sample between the scans, and the magnification of each "
                   "scan.")  # fmt: skip
 @click.option("--states", metavar="NAME,NAME",
-              help="These two materials are states of one material, such as charged and discharged. The sum of both "
-                  "does not change; the fraction of each state becomes smooth in space.")  # fmt: skip
+              help=(
+                  "Names of two materials that are states of one material, such as charged and discharged. The fit "
+                  "then keeps the sum of their densities, and makes the fraction of each state smooth in space."
+              ))  # fmt: skip
 @click.option(
     "--axis", type=float, metavar="COL", help="Column of the rotation axis. Default: found in the first scan."
 )
@@ -99,7 +101,7 @@ def read_spectra(path: Path) -> Spectra:
     type=click.IntRange(0),
     nargs=2,
     metavar="FIRST END",
-    help="First detector row to use, and the one after the last. Default: all.",
+    help="First detector row to use, and the row after the last row to use. Default: all rows.",
 )
 @click.option("--bin", "binning", type=click.IntRange(1), default=1, show_default=True, help="Average N x N pixels.")
 @json_option

@@ -62,7 +62,10 @@ def series_of_scene(
     ends |= {key: getattr(own, key) for key in ("sod", "sdd") if getattr(own, key) is not None}
     opened = open_scene(name, [f"beam={{{', '.join(f'{key}: {_plain(value)}' for key, value in ends.items())}}}"])
     if not isinstance(opened.scene.sample, Mixture):
-        raise ConfigError(f"{opened.path}: the sample has no key `material`, so it is the same at every energy.")
+        raise ConfigError(
+            f"{opened.path}: give the sample the key `material`: without a material, the sample looks the same at "
+            "every energy."
+        )
     beam = Beam(own.photons_per_s, own.sod, own.sdd, float(energies.mean()), own.bandwidth, own.harmonics)
     chosen = _chosen(opened.scene.sample, material)
     try:

@@ -56,7 +56,7 @@ def test_the_shipped_scene_has_its_white_line_at_8348_5_ev(folder: Path) -> None
 def test_where_there_is_no_edge_it_says_so(folder: Path) -> None:
     result = xafs("edge_scan", "--from", "8.25", "--to", "8.29", "--step", "0.002", "-o", "far.png")
     assert result.exit_code == 6, result.output
-    assert "the curve is as smooth as a curve without an edge" in result.stdout
+    assert "the absorption curve is as smooth as a curve without an edge" in result.stdout
     assert Path("far.png").exists() and Path("far.csv").exists()
 
 

@@ -114,7 +114,7 @@ def test_a_beam_too_bright_for_the_sensor_tells_nothing(tmp_path: Path) -> None:
     ("changes", "material", "words"),
     [
         ({"phantom": {"kind": "solids", "solids": [{"kind": "box", "edges": [1, 1, 1], "attenuation": 1}]}}, None,
-         "has no key `material`, so it is the same at every energy"),
+         "give the sample the key `material`: without a material"),
         ({"phantom": SCENE["phantom"] | {"materials": {}}}, None, "choose one of electrolyte, NMC811 .0 of them have"),
         ({}, "Cu", "--material Cu: choose one of electrolyte, NMC811"),
         ({"beam": {"photons_per_s": 1}}, None, "materials need the beam's energy"),

@@ -53,7 +53,9 @@ _FILE = click.Path(path_type=Path)
 @click.option(
     "--particles",
     type=click.IntRange(1),
-    help="Number of the material that forms the particles, from 1, the least dense. Default: the densest.",
+    help=(
+        "Number of the material that forms the particles; 1 is the least dense material. Default: the densest material."
+    ),
 )
 @click.option(
     "--through",
@@ -107,7 +109,7 @@ _FILE = click.Path(path_type=Path)
     type=click.IntRange(0),
     nargs=2,
     metavar="FIRST END",
-    help="First slice to measure and the one after the last. Default: all.",
+    help="First slice to measure, and the slice after the last slice to measure. Default: all slices.",
 )
 @click.option(
     "--radius",
@@ -129,8 +131,10 @@ _FILE = click.Path(path_type=Path)
     type=click.FloatRange(min=0),
     default=0.8,
     show_default=True,
-    help="Two touching parts count as one particle if the neck has at least this fraction of the width of the narrower "
-    "part; 0: touching parts always count as one.",
+    help=(
+        "Smallest width of the neck between two touching parts, as a fraction of the width of the narrower part, "
+        "with which the two parts count as one particle; 0: touching parts always count as one particle."
+    ),
 )
 @click.option(
     "--side",

@@ -75,8 +75,8 @@ def measured(path: Path, read: volumes.ReadSlices, box: volumes.Box, answer: Ans
         materials = (f"{each:g} is material {number}" for number, each in enumerate(labels, 1))
         answer.warn(
             Note(
-                f"{path} contains few different values, so they are read as labels and not as grey values: "
-                f"{', '.join(materials)}."
+                f"{path} contains only few different values. These values are read as labels and not as grey "
+                f"values: {', '.join(materials)}."
             )
         )
     if max(particles, values["through"]) > n_materials:
@@ -122,8 +122,8 @@ def halves_in(path: Path, read: volumes.ReadSlices, answer: Answer, **values: An
     scan = values["scan"] or Path(read.record.raw_file)
     if not scan.is_file():
         answer.warn(
-            f"The intervals of {path} leave out the error from few projections, because its scan {scan} does not "
-            "exist. Give --scan or --parts."
+            f"The intervals of {path} leave out the error from few projections, because the scan {scan}, which the "
+            "volume names, does not exist. Give --scan or --parts."
         )
         return []
     if (n_views := int(read.record.parameters.get("n_views", FEWEST_VIEWS))) < FEWEST_VIEWS:

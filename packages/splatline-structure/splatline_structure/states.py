@@ -116,8 +116,9 @@ def measure_states(paths: Sequence[Path], output: Path, answer: Answer, values: 
         states.append(MeasuredState(path, x, n_views, numbers_of(reference, fit), fit.matches))
         if not fit.matches:
             answer.warn(
-                f"{path} shows another sample than {first}, or a sample that has mostly changed: less than half of the "
-                "particles of the reference are in it. The numbers of this state are not determined."
+                f"{path} shows another sample than {first}, or a sample that has mostly changed: fewer than half of "
+                "the particles of the reference are found in the state. The numbers of this state are not "
+                "determined."
             )
     if not any(state.matches for state in states):
         raise DataError(

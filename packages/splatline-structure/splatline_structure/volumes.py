@@ -131,9 +131,9 @@ def read_volume(
         fitting = slice(first + excess // 2, end - (excess - excess // 2))
         limit_sentence = (
             f"Only {most} of {end - first} slices fit into {size(memory)} of memory, so the numbers are measured in "
-            f"the middle, in the slices {fitting.start}:{fitting.stop}. Numbers whose names end in _all are measured "
-            f"in {first}:{end}, but their intervals are those of the middle. To measure more slices, free memory or "
-            "give more --memory."
+            f"the middle, in the slices {fitting.start}:{fitting.stop}. Numbers whose names end in _all are "
+            f"measured in the slices {first}:{end}, but with the intervals of the middle slices. To measure more "
+            "slices, free memory or give more --memory."
             if excess
             else ""
         )
@@ -145,8 +145,8 @@ def read_volume(
             )
         if crop != "finite" and (share := 1 - np.isfinite(values).mean()):
             raise DataError(
-                f"{share:.2%} of the voxels of {path} are not finite. If they are outside the circle of the field of "
-                "view, use --crop finite, which measures the square inside the circle. Nothing was written."
+                f"{share:.2%} of the voxels of {path} are not finite. If these voxels are outside the circle of the "
+                "field of view, use --crop finite, which measures the square inside the circle. Nothing was written."
             )
         record = replace(record, volume=Volume(values, grid), length_unit="mm", deviation=None, series=None)
         return ReadSlices(record, fitting, slice(first, end), n_slices, limit_sentence)

@@ -29,7 +29,7 @@ def _device_name(ctx: click.Context, param: click.Parameter, value: str) -> str:
 @click.option(
     "--control",
     is_flag=True,
-    help="Let clients pause, resume, stop and abort the scan, and decide what it measures next.",
+    help="Let clients pause, resume, stop and abort the scan, and decide what the scan measures next.",
 )
 def tango(runs: Path, device: str, bind: str, port: int, instance: str | None, control: bool) -> None:
     """Serve the running scan as a Tango device.

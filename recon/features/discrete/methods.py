@@ -65,8 +65,8 @@ class Discrete(HalfVoxels):
 
     Attributes:
         iterations: largest number of iterations over all projections, not counting the FISTA-TV iterations before them.
-        levels: densities of the materials in 1/mm, ascending; None: found by EM. If no projections can be held out,
-            voxels are pulled weakly to the given `levels`.
+        levels: densities of the materials in 1/mm, ascending; None: found by expectation maximisation (EM). If no
+            projections can be held out, voxels are pulled weakly to the given `levels`.
         still, half_voxels: as in `FistaTv`.
     """
 

@@ -72,8 +72,8 @@ class Cgls(VoxelMethod):
     to stop early.
 
     After the last iteration, negative voxels are set to 0, unless `allow_negative` is True. In float32, rounding makes
-    the search directions lose conjugacy after about eight iterations. From then on, CGLS in float32 is about one
-    iteration behind CGLS in exact arithmetic. Memory: 3 volumes and 3 times the projections.
+    the search directions lose conjugacy after about eight iterations. After about eight iterations, CGLS in float32 is
+    about one iteration behind CGLS in exact arithmetic. Memory: 3 volumes and 3 times the projections.
     """
 
     name: ClassVar[str] = "cgls"

@@ -136,21 +136,22 @@ def fit_series(
     go_on: Callable[[int, float], bool] = lambda sweep, residual: True,
     stop: Callable[[], bool] = lambda: False,
 ) -> TimedVolumes:
-    """Volumes at evenly spaced times, from one least-squares fit to all projections with total variation.
+    """Volumes at evenly spaced times, from one least-squares fit to all projections with total variation:
 
-        min ½ Σ_v |A_v W(t_v) Σ_k h_k(t_v) x_k - p_v|² + Σ_j μ_j TV(z_j),    x_k >= 0
+        min ½ Σ_v |A_v W(t_v) Σ_k h_k(t_v) x_k - p_v|² + Σ_j μ_j TV(z_j),    x_k >= 0.
 
-    h_k are hat functions, so the volume is linear in time between knots. The operator W displaces the volume, smoothly
-    in space and time, and is the identity in the middle of the scan (module `motion`). Mathematically this is the
-    problem of `fit_materials`: knots replace the materials, and hat functions replace the cross sections. z_j are the
-    orthonormal components of all volumes x_k; the first one is their common part. If nothing moves, `fit_series` also
-    tries volumes that are the mean volume multiplied by factors, which are smooth in space. `fit_series` returns
-    volumes with smooth factors if these volumes predict held-out projections better than separate volumes. Smooth
-    factors suit a sample of particles in which each particle takes up or loses material at its own time. Steps, memory,
-    `go_on` and `stop` of `fit_series` are as in `fit_materials`. Up to four tests come before the fit: they choose the
-    weights, decide whether the sample moves, estimate the motion, and choose the smoothness of the factors. During each
-    test, `go_on` gets a countdown that ends at 0. After the last iteration of the fit, `go_on` gets a countdown of the
-    steps that fit the factors. If `go_on` ends the fit of the factors early, the result is the volumes without factors.
+    The functions h_k are hat functions, so the volume is linear in time between knots. The operator W displaces the
+    volume, smoothly in space and time, and is the identity in the middle of the scan (module `motion`). Mathematically
+    this is the problem of `fit_materials`: knots replace the materials, and hat functions replace the cross sections.
+    The z_j are the orthonormal components of all volumes x_k; the first component is the common part of all volumes. If
+    nothing moves, `fit_series` also tries volumes that are the mean volume multiplied by factors, which are smooth in
+    space. `fit_series` returns volumes with smooth factors if these volumes predict held-out projections better than
+    separate volumes. Smooth factors suit a sample of particles in which each particle takes up or loses material at its
+    own time. Steps, memory, `go_on` and `stop` of `fit_series` are as in `fit_materials`. Up to four tests come before
+    the fit: they choose the weights, decide whether the sample moves, estimate the motion, and choose the smoothness of
+    the factors. During each test, `go_on` gets a countdown that ends at 0. After the last iteration of the fit, `go_on`
+    gets a countdown of the steps that fit the factors. If `go_on` ends the fit of the factors early, the result is the
+    volumes without factors.
 
     Args:
         knots: number of volumes, 2 or more.

@@ -75,9 +75,9 @@ def fit_materials(
     stop: Callable[[], bool] = lambda: False,
 ) -> Materials:
     """The densities of the materials, from one least-squares fit to the projections of all energies with total
-    variation.
+    variation:
 
-        min over z of ½ Σ_v |A_v Σ_k U[e(v), k] z_k - p_v|² + Σ_k μ_k TV(z_k),    densities >= 0
+        min over z of ½ Σ_v |A_v Σ_k U[e(v), k] z_k - p_v|² + Σ_k μ_k TV(z_k),    densities >= 0.
 
     The singular value decomposition of the cross sections is U S Vᵀ (each energy weighted by its number of
     projections). The densities of the materials are V S⁻¹ z. The columns of U are orthonormal, so all components z_k
