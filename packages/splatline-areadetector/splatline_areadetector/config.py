@@ -194,37 +194,38 @@ class RideConfig(Section):
 
 
 EXAMPLE = """\
-# Recording the scan of another program (docs/areadetector.md). beamline ride writes no process variable.
-# beamline ride FILE --check   shows the settings of the IOC, and whether the frames of 2 s are complete.
-# Units are in the names: s, deg, mm, um, keV. null means "not known" or "the default".
+# `beamline ride` with this file records a scan that another program runs (docs/areadetector.md). It writes no process
+# variable. `beamline ride FILE --check` shows the settings of the IOC, and whether the frames of 2 s are complete.
+# Units are in the names of the keys: s, deg, mm, um, keV. null means "not known" or "use the default".
 
 sample: {name: tooth, description: "", diameter_mm: null}
 
 ride:
   image: "pva://2bmSP2:Pva1:Image"      # PvName of NDPluginPva or NDPluginPvxs
-  # from: tomoscan   prefix                             its process variables: start, step, kinds and numbers of frames
+  # from: tomoscan   prefix                             process variables of tomoscan: start, step, kinds of frames
   #       plan       views, start_deg, step_deg         equal steps from the first projection
   #       attribute  views, name                        step scans: an NDAttribute in degrees
   #       panda      views, file, dataset, deg_per_unit, offset_deg   the HDF5 file of a PandABox (SWMR)
   angles: {from: tomoscan, prefix: "ca://2bmb:TomoScan:"}
-  kinds: null                           # NDAttribute with the kind of a frame (HDF5FrameLocation); null: tomoscan's
-                                        # status, or the order (give darks and flats of files by --darks, --flats)
-  camera: "ca://2bmSP2:cam1:"           # for the camera's port, exposure and counters; null: not used
-  source: null                          # port whose frames are stored as they are, such as ROI1; null: the camera's
-  first_id: null                        # uniqueId of the first projection; null: that of the first that arrives
-  exposure_s: null                      # null: from the attribute AcquireTime, tomoscan or the camera
+  kinds: null                           # NDAttribute with the kind of a frame (HDF5FrameLocation); null: from
+                                        # tomoscan's status, or from the order of the frames (for darks and flats in
+                                        # files, use --darks and --flats)
+  camera: "ca://2bmSP2:cam1:"           # to read the camera's port, exposure and counters; null: do not read them
+  source: null                          # port whose frames are stored unchanged, such as ROI1; null: camera's frames
+  first_id: null                        # uniqueId of the first projection; null: of the first one that arrives
+  exposure_s: null                      # null: from the attribute AcquireTime, from tomoscan or from the camera
   period_s: null                        # approximate time between frames, for the queue; null: 100 frames a second
-  bits: null                            # of a pixel, for saturation; null: those of the pixel type
-  queue_s: 1                            # frames that the server buffers for this program,
-  queue_mb: 512                         #   and the most memory for them there
-  ring_mb: 2048                         # most memory here for frames that wait for the disk
-  silence_s: 60                         # after this time without a frame a message says why
+  bits: null                            # bits of a pixel, for the saturation value; null: all bits of the pixel type
+  queue_s: 1                            # seconds of frames that the server buffers for this program
+  queue_mb: 512                         # largest memory of the IOC for this buffer
+  ring_mb: 2048                         # largest memory of this program for frames that wait for the disk
+  silence_s: 60                         # if no frame comes for this time, a message gives the reason
 
 optics:
-  pixel_size_um: 0.65                   # of an unbinned pixel at the sample
+  pixel_size_um: 0.65                   # size of an unbinned pixel at the sample
   energy_kev: null
   distance_mm: null
-  axis_col: null                        # column of the rotation axis; null: it is searched for
+  axis_col: null                        # column of the rotation axis; null: searched in the data
 
 storage: {folder: runs}
 recon: {live: true, method: r2, axis: auto}

@@ -68,7 +68,7 @@ class Basis(Enum):
     NUMBERS = "the frame whose number follows the number of the last frame before the block"
     COUNTER = "the frame with the number that was calculated from the camera's counter"
     WAITED = "the first frame that arrived"
-    UNKNOWN = "the first frame that arrived, although others may have come before it"
+    UNKNOWN = "the first frame that arrived, although earlier frames may be lost"
 
     @property
     def is_sure(self) -> bool:
