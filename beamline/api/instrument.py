@@ -34,7 +34,7 @@ _OF_A_SCAN = ("roi", "binning", "readout")  # settings of the camera that every 
 
 
 class ScanResult(RunResult):
-    """Result of a scan for scripts and notebooks: a `RunResult` that is also shown well in a notebook."""
+    """Result of a scan for scripts and notebooks: a `RunResult` that a notebook shows as a picture with a table."""
 
     def _repr_html_(self) -> str:
         """HTML for a notebook: the middle projection as counts, and the results of the scan and of its monitor."""
@@ -78,7 +78,7 @@ class Instrument:
         self.close()
 
     def close(self) -> None:
-        """Close all ports and the camera; calling it again does nothing."""
+        """Close all ports and the camera. A second call of `close` does nothing."""
         self._open = False
         self._devices.close()
 
@@ -96,9 +96,9 @@ class Instrument:
         """Run a scan in the same way as `beamline scan`: in a new folder, with a check of every frame, and with a file
         that stays readable after a failure.
 
-        The first Ctrl-C stops the scan cleanly, and the second Ctrl-C aborts it. Both raise an error, so they also end
-        a loop over samples. If this function runs in another thread than the main thread, use `stop` instead of Ctrl-C,
-        because Python delivers signals only to the main thread.
+        The first Ctrl-C stops the scan cleanly, and the second Ctrl-C aborts it. The stop and the abort both raise an
+        error, so each of them also ends a loop over samples. If this function runs in another thread than the main
+        thread, use `stop` instead of Ctrl-C, because Python delivers signals only to the main thread.
 
         Args:
             sample: name of the sample, which is written to the file and into the folder's name; None: the configured
@@ -108,19 +108,19 @@ class Instrument:
             set: configuration values for this scan only, such as {"scan.angles.views": 90}.
             output: folder in which the run's folder is created; None: `storage.folder`.
             live: False: without a live reconstruction, even if `recon.live` is on.
-            stop: request with which another thread can end the scan.
-            on_event: function that gets every event of the run. It is called in a separate thread.
+            stop: a `StopRequest`, with which another thread can stop or abort the scan.
+            on_event: function that gets every event of the run. The function is called in a separate thread.
 
         Raises:
-            ConfigError: a value is wrong, exceeds a limit, or would require opening the devices again. Nothing has
-                moved.
+            ConfigError: a value is wrong, exceeds a limit, or belongs to a key that only `connect` can apply. Nothing
+                has moved.
             DeviceError: a device failed.
             DataError: frames are missing, or the disk failed.
             ReferencesError: darks or flats cannot be used.
             ScanStopped: Ctrl-C, `stop`, or a check of the monitor ended the scan; ScanAborted: the scan was aborted.
 
-        In all these cases the frames taken so far are in the file: see `last`. If the scan ends early because it has
-        enough projections (`scan.decide`), no error is raised.
+        After an error during the scan, the frames taken so far are in the file, which `last` names. If the scan ends
+        early because it has enough projections (`scan.decide`), no error is raised.
         """
         refuse_wrong_arguments(Instrument.scan, locals())
         if not self._one_at_a_time.acquire(blocking=False):
@@ -195,7 +195,8 @@ def connect(
 
     Raises:
         ConfigError: the configuration is wrong; the message lists every fault with file, line, key and allowed values.
-        DeviceError: a device does not answer. The devices that are already open are closed again.
+        DeviceError: a device does not answer. Before the error is raised, `connect` closes the devices that are already
+            open.
     """
     refuse_wrong_arguments(connect, locals())
     read = load(config, [override_of(key, value) for key, value in (set or {}).items()])
@@ -229,7 +230,8 @@ def plan(
     Args:
         scans: each is a configuration file, a table of scans (.csv), a row of a table of scans as a mapping, such as
             {"config": "my.yaml", "sample.name": "cell_1", "scan.exposure_s": 0.1}, or a plan of bluesky, such as
-            `fly(scan)`. A plan of bluesky is read without running it, and cannot be run afterwards.
+            `fly(scan)`. The function reads a plan of bluesky to its end without running it; bluesky cannot run that
+            plan object afterwards.
         set: values that replace values in all configurations, such as {"scan.angles.views": 90}.
         output: folder in which the scans would create the folders of their runs; None: `storage.folder`.
         rehearse: plan a real configuration with simulated devices.
@@ -241,8 +243,8 @@ def plan(
         what the `operator` has to do. The `needs` of the plan itself are the sums over the scans that can run.
 
     Raises:
-        ConfigError: an argument has the wrong type. If a scan has an error, nothing is raised: the error is listed in
-            the `faults` of the scan.
+        ConfigError: an argument has the wrong type. An error in a single scan raises no exception: the `faults` of the
+            scan list the error.
     """
     refuse_wrong_arguments(plan, locals())
     described = list[Path | Mapping[str, object] | PlannedScan]()

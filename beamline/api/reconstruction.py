@@ -69,10 +69,11 @@ def reconstruct(
         rows: detector rows to use, such as slice(500, 756); the volume has one slice per row.
         views: projections to use: all, fixed:90, first:60, every:2, ... as for the option --views.
         binning: number of pixels averaged along each side.
-        selection: further options, such as Selection(axis_col=1023.5, steps=(Rings("vo"),)), whose steps are in
-            `beamline.projections.corrections`. The arguments above take precedence.
-        output: file for the volume, as for the option -o (.h5, .tif, .npy, ...). The report is written next to this
-            file. If `output` is None, no file is written. If the scan does not fit into the memory, an output file is
+        selection: further options, such as Selection(axis_col=1023.5, steps=(Rings("vo"),));
+            `beamline.projections.corrections` defines the steps. `rows`, `views` and `binning`, if given, replace
+            the values in the selection.
+        output: file for the volume, as for the option -o (.h5, .tif, .npy, ...). The report is written next to the
+            volume. If `output` is None, no file is written. If the scan does not fit into the memory, an output file is
             required.
         say: function that gets each message that the command would print; None: no messages.
 
@@ -165,11 +166,12 @@ def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
 
     Frames are counts: `frame.counts` uint16 [row, col].
 
-    If the scan is fast, call `stream` in another process than the scan. In the same process, reading and writing wait
-    for each other, so that a slow reader slows the scan down.
+    If the scan is fast, call `stream` in another process than the scan. Within one process, reading and writing the
+    scan file wait for each other, so that a slow reader slows the scan down.
 
     Args:
-        path: a scan file, or the folder of a run (its newest part). The file need not exist yet.
+        path: a scan file, or the folder of a run (its newest part). The scan file need not exist yet: the function
+            waits at most 120 s for it.
         follow: False: only the frames that are already in the file.
 
     Raises:

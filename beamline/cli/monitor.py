@@ -62,10 +62,10 @@ def monitor(request: MonitorRequest) -> None:
     beamline monitor SCAN.h5 --sheet worst.png    also draw the worst frames
 
     FILE may have any format that `beamline recon` reads, and is not changed. For each check the command prints the
-    flagged frames, the worst score with its limit, the place in the frame and what to do. It also prints which checks
-    could not be applied to which projections.
+    flagged frames, the worst score with its limit, the place in the frame and what to do. The command also prints how
+    many projections each check had to skip, and why.
 
-    Exit code: 0 no alarm, 4 stopped, 7 frames with an alarm, or a fault of the darks or flats.
+    Exit code: 0 no alarm; 4 the command was stopped; 7 at least one frame has an alarm, or darks or flats have a fault.
     """
     from beamline.config.load import load
     from beamline.config.monitor import configured_checks, reference_limits

@@ -141,13 +141,13 @@ def scan(request: ScanRequest) -> None:
     beamline scan --resume RUN         continue a run that ended early
 
     Each run gets a new folder, named with UTC time and sample. The first Ctrl-C, SIGTERM, or closing the terminal
-    stops the scan cleanly; the second Ctrl-C aborts it. The scan file is readable in both cases.
+    stops the scan cleanly; the second Ctrl-C aborts it. After a stop and after an abort, the scan file is readable.
 
-    Several CONFIGs, or a TABLE.csv with one line per scan (docs/commands.md), run one after the other. If one scan
-    fails, the next one starts anyway; Ctrl-C ends all of them.
+    If you give several CONFIGs, or a TABLE.csv with one line per scan (docs/commands.md), the scans run one after the
+    other. If one scan fails, the next one starts anyway; Ctrl-C ends all of them.
 
-    If CONFIG has `scan.energies` or `scan.states`, the command takes a scan at each energy or of each state, and puts
-    all of them in one folder. --resume can continue such a series, too.
+    If CONFIG has `scan.energies` or `scan.states`, the command takes one scan at each energy, or one scan of each state
+    of the sample, and puts all these scans in one folder. --resume can also continue a series of energies or states.
 
     Exit codes are listed in `beamline --help`. 6: darks or flats cannot be used. 7: the scan is complete, but frames
     have an alarm of the monitor, or darks or flats have a fault.

@@ -30,8 +30,8 @@ class ConfigError(BeamlineError):
     """An argument or the configuration is wrong. Nothing was started.
 
     Args:
-        faults: list of single errors. Each error has the place of the value (`my.yaml:12`) and a sentence without a
-            full stop. The list is empty if the message is complete without it.
+        faults: the single errors; each error is a pair of the place of the wrong value (`my.yaml:12`) and a sentence
+            without a full stop. The list of faults is empty if the message alone describes the error.
     """
 
     exit_code = 2
@@ -48,7 +48,7 @@ class InstrumentError(BeamlineError):
 
 
 class ScanStopped(BeamlineError):  # noqa: N818 - an outcome, not a defect
-    """The operator stopped the scan before all frames were taken; the file is readable."""
+    """The operator or a check of the monitor stopped the scan before all frames were taken; the file is readable."""
 
     exit_code = 4
 

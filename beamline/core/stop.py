@@ -200,9 +200,9 @@ class StopRequest:
     """A request to stop a scan (finish cleanly with fewer frames) or to abort it (end at once). A request cannot be
     undone.
 
-    Any thread or signal handler can make the request. No lock is used: a signal handler may interrupt another handler,
-    and would then wait for ever for a lock that the interrupted handler holds. Instead, a single assignment sets each
-    flag.
+    Any thread or signal handler can make the request. The class uses no lock, because a signal handler that interrupts
+    another handler would wait for ever for a lock that the interrupted handler holds. Instead, a single assignment sets
+    each of the attributes below.
 
     Args:
         now: a clock that gives real time in s.

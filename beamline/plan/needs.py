@@ -24,9 +24,9 @@ class ScanNeeds:
         parts: duration in s of each part: `dark`, `flat`, `projection`, `offset_view` (each with the moves of the
             stage), `warm_up`, `return`. The time for moving shutter and sample is not known.
         n_frames, total_bytes: number of frames and bytes of the files, without projections that are taken again.
-            dose_gy: dose in Gy that the sample absorbs; None: `optics.dose_rate_gy_s` is not stated. volume_seconds:
-            longest time in s from the last projection until the live volume is finished.
-        operator: requests to the operator.
+        dose_gy: dose in Gy that the sample absorbs; None: `optics.dose_rate_gy_s` is not stated.
+        volume_seconds: longest time in s from the last projection until the live volume is finished.
+        operator: what the scan asks the operator to do by hand, such as moving the sample.
     """
 
     parts: Mapping[str, float] = field(default_factory=dict)

@@ -83,7 +83,7 @@ class Selection:
 
         Raises:
             ConfigError: the rows lie outside the detector, a bin is larger than the selected rows or the width of
-                the detector, or the pixel size is impossible.
+                the detector, or the pixel size lies outside the allowed range.
         """
         size_mm, whose = self.pixel_size_mm, "--pixel-size-um"
         if size_mm is None:

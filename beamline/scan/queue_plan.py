@@ -20,8 +20,12 @@ from beamline.scan.dry_run import DryRun
 
 @dataclass(frozen=True)
 class ScanFault:
-    """The reason why a scan cannot run, as a sentence. file, line: place of the value in a file; None if the value is
-    not in a file, or if the sentence is about several lines.
+    """The reason why a scan cannot run.
+
+    Attributes:
+        message: the reason, as a sentence.
+        file, line: place of the wrong value; None if the value is not in a file, or if the reason concerns several
+            lines.
     """
 
     message: str
@@ -40,11 +44,12 @@ class PlannedScan:
     Attributes:
         source: the file of its configuration, or the line of its table (day.csv:3).
         sample: name of the sample; empty if the configuration cannot be read.
-        faults: reasons why the scan cannot run; empty: the scan can run. warnings: sentences on unusual values, for
-            example because of a wrong unit. needs: time, frames, bytes, dose, and requests to the operator; all are 0
-            if they cannot be computed. disk: an existing folder on the disk of the file; None: there is no file.
+        faults: reasons why the scan cannot run; empty: the scan can run.
+        warnings: sentences on unusual values, for example because of a wrong unit.
+        needs: time, frames, bytes, dose, and requests to the operator; all are 0 if they cannot be computed.
+        disk: an existing folder on the disk to which the scan file will be written; None: the scan writes no file.
         config: the configuration; None if it cannot be read.
-        worked: the plan with its timeline and limits; None if it cannot be computed.
+        worked: the dry run of the scan, with its timeline and limits; None if the dry run fails.
     """
 
     source: str
@@ -72,9 +77,11 @@ class QueuePlan:
     """Several scans, one after the other, planned without devices.
 
     Attributes:
-        scans: the scans in their order. faults: reasons why the scans cannot all run, although each scan could run
-            alone; for example a disk that is too small for all files. needs: needs of all scans that can run, together.
-            free_bytes: free space in bytes on the fullest of the disks; 0 if no scan can run.
+        scans: the scans in their order.
+        faults: reasons why the scans cannot all run, although each scan could run alone; for example a disk that is
+            too small for all files.
+        needs: sum of the needs of all scans that can run.
+        free_bytes: free space in bytes on the fullest of the disks; 0 if no scan can run.
     """
 
     scans: tuple[PlannedScan, ...]

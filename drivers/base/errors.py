@@ -14,9 +14,13 @@ class DeviceError(Exception):
 
     Attributes:
         device: name of the device.
-        problem: the problem. request: the text that was sent to the device. reply: the answer of the device. expected:
-            the reply that was expected. advice: the action to take. state: the changes and moves that were made, and
-            those that were not. wire: the last lines sent and received.
+        problem: what went wrong, in words.
+        request: the text that was sent to the device.
+        reply: the answer of the device.
+        expected: the reply that was expected.
+        advice: what the operator should do.
+        state: which changes and moves were made before the error, and which were not.
+        wire: the last lines sent and received.
     """
 
     def __init__(
@@ -49,8 +53,8 @@ class DeviceError(Exception):
         return __newobj__, (type(self), *self.args), vars(self)
 
     def told_by(self, device: str, problem: str, **changed: str) -> DeviceError:
-        """The same error as an error of `device`, which uses the device that failed. `changed` contains the parts of
-        the error that are replaced.
+        """A copy of this error that names `device` and `problem` instead. For example, a stage reports an error of its
+        serial port as its own. `changed` replaces further parts of the error, by name.
         """
         parts = ("request", "reply", "expected", "advice", "state", "wire")
         return type(self)(device, problem, **({part: getattr(self, part) for part in parts} | changed))

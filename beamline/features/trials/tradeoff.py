@@ -143,7 +143,7 @@ def plan(methods: Sequence[str], n_views: int, depth: Depth) -> tuple[MethodTria
 
     Args:
         methods: names in `recon.methods`, in the order wanted.
-        depth: "quick" has about half as many trials as "full", and shorter ones.
+        depth: "quick" makes about half as many trials as "full", and each trial is shorter.
 
     Raises:
         ValueError: a method does not exist.
