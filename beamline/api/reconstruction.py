@@ -127,7 +127,9 @@ def _rows(source: SourceOptions, rows: slice | tuple[int, int]) -> tuple[int, in
     with source.open() as opened:
         first, end, step = rows.indices(opened.shape[0])
     if step != 1:
-        raise ConfigError(f"rows {rows}: rows must be consecutive; omit the step. Nothing was written.")
+        raise ConfigError(
+            f"rows {rows}: the detector rows must be consecutive; give a slice without a step. Nothing was written."
+        )
     return first, end
 
 

@@ -105,7 +105,9 @@ def scans_of(plan: Generator[Any, Any, Any]) -> tuple[PlannedScan, ...]:
                 # this item makes no volume
                 scans.append(replace(planned, needs=replace(planned.needs, volume_seconds=0.0)))
             reply = others.take(message)
-        others.faults.append(ScanFault(f"the plan does not end within {MOST} messages"))
+        others.faults.append(
+            ScanFault(f"the plan may never end: it sent {MOST} messages, the most that this estimate follows")
+        )
     except StopIteration:
         pass
     except ConfigError as error:
@@ -113,7 +115,9 @@ def scans_of(plan: Generator[Any, Any, Any]) -> tuple[PlannedScan, ...]:
     except Exception as error:  # an error of the plan, because it got no measured values
         what = f"{type(error).__name__}: {error}"
         others.faults.append(
-            ScanFault(f"the plan cannot be predicted, because it stops without measured values ({what})")
+            ScanFault(
+                f"the plan cannot be predicted, because it raises an error if it gets no measured values ({what})"
+            )
         )
     if others.needs or others.faults:
         rest = f"{source}, other messages" if scans else source

@@ -99,7 +99,7 @@ def unknown_method(name: str, legal: Iterable[str]) -> str:
 
 
 _ELSEWHERE = {
-    "times": "reconstructs several volumes at successive times: use beamline recon --volumes N",
+    "times": "makes a series of volumes at successive times, which only `beamline recon --volumes N` can make",
 }
 """The command that runs a method that makes several volumes."""
 

@@ -97,8 +97,9 @@ def config_option(command: Callable[..., Any]) -> Callable[..., Any]:
         is_eager=True,
         expose_value=False,
         callback=_take,
-        help="Recipe: a YAML file with options by their long names, as --write-config writes it, or a volume, whose "
-        "options are then used again. Options on the command line override it.",
+        help="Recipe: a YAML file with options by their long names, as --write-config writes it. If you give a "
+        "volume instead, the options that made this volume are used again. Options on the command line "
+        "override the recipe.",
     )(command)
 
 

@@ -157,8 +157,8 @@ recon_options = together(
         former="--earlier",
         needs=(
             "follow",
-            "is only for a run that `beamline scan --resume` is still continuing: add --follow. If the run has "
-            "ended, give the joined.h5 of its parts as FILE.",
+            "works only while `beamline scan --resume` continues the run: add --follow. If the run has ended, give "
+            "joined.h5 (all parts of the run) as FILE.",
         ),
         of_one_call=True,
         type=click.Path(path_type=Path),

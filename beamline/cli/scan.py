@@ -97,7 +97,7 @@ class ScanRequest:
         type=click.Path(path_type=Path, exists=True, file_okay=False),
         excludes={
             "output": "the run already has its folder",
-            "reference": "the run keeps the reference of its configuration",
+            "reference": "a resumed run keeps the reference volume of its configuration",
             "rehearse": "a rehearsal always starts a new run, and --resume uses the devices stored in RUN",
             "documents": "documents can describe only complete scans",
         },

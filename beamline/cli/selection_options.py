@@ -139,7 +139,10 @@ scan_options = together(
 light_options = together(
     option(
         "--photons-per-count",
-        excludes={"spectra": "for scans at several energies the dose is stated as a number of frames"},
+        excludes={
+            "spectra": "photons are not counted for scans at several energies; the report states their dose "
+            "as a number of frames"
+        },
         type=POSITIVE,
         help="Number of X-ray photons at the sample for one count of the camera.",
     ),

@@ -139,7 +139,8 @@ class Terminal:
                     "kernels",
                     n,
                     0,
-                    f"{n} compiled in {seconds:.0f} s (only the first time on a computer; takes 1 to 2 minutes)",
+                    f"{n} kernels compiled in {seconds:.0f} s (only the first time on a computer; takes 1 to 2 "
+                    "minutes)",
                 )
             case FitReached(_, step, steps):
                 self._show("volume", step, steps, fit(event))
@@ -291,7 +292,7 @@ def results(record: ReconRecord) -> str:
         "volumes" if several else "volume": f"{several}{shape} in {record.unit or 'volume fractions'}{span}",
         "axis": f"column {record.axis_col:.2f}",
         "cone": "magnification" in numbers
-        and "magnification {magnification:.4g}, voxels of {voxel_mm:.4g} mm, fan of {fan_deg:.3g} degrees".format(
+        and "magnification {magnification:.4g}, voxels of {voxel_mm:.4g} mm, fan angle {fan_deg:.3g} degrees".format(
             **numbers
         ),
         "chosen": record.chosen,

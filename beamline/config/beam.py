@@ -57,8 +57,8 @@ class StageMover(MotorSection):
     out_deg: float = setting(doc="Position of the sample while flats are taken.")
     mm_per_deg: float | None = setting(
         None,
-        "Distance in mm that the sample moves per unit of the axis of the mover; positive: towards higher columns of "
-        "the frame. null: unknown, or the sample does not move across the beam.",
+        "Distance in mm that the sample moves across the beam if the position of the mover changes by one unit; "
+        "positive: towards higher columns of the frame. null: unknown, or the sample does not move across the beam.",
         ge=-1e3,
         le=1e3,
     )
@@ -145,18 +145,18 @@ class BeamMonitorSection(Section):
     scale: float = setting(1.0, "Factor that converts the reading to `unit`.", gt=0)
     timeout_s: float = setting(2.0, gt=0, le=1e6)
     period_s: float = setting(
-        1.0, "Real time between readings during a scan. The readings are stored in the file of the scan.", gt=0, le=1e6
+        1.0, "Time in s between two readings during a scan. The readings are stored in the scan file.", gt=0, le=1e6
     )
     pause_below: float | None = setting(
         None, "Reading below which the scan pauses, in the unit of the key `unit`; null: the scan never pauses.", gt=0
     )
     resume_above: float | None = setting(
         None,
-        "Reading from which on a paused scan continues, in the unit of the key `unit`; null: a tenth above "
+        "Reading at or above which a paused scan continues, in the unit of the key `unit`; null: 1.1 times "
         "pause_below.",
         gt=0,
     )
-    settle_s: float = setting(5.0, "Time for which the beam must be back before the scan continues.", ge=0)
+    settle_s: float = setting(5.0, "Time in s for which the beam must be back before the scan continues.", ge=0)
 
     @model_validator(mode="after")
     def _resumes_where_it_would_not_pause(self) -> Self:
@@ -194,7 +194,7 @@ class StageOutputShutter(Section):
     kind: Literal["stage_output"]
     output: int = setting(doc="Number of the output. The output must not be that of the trigger pulses.", gt=0)
     open_high: bool = setting(True, "true: a high output opens the shutter.")
-    settle_s: float = setting(0.1, "Time that the blade needs to open or close.", ge=0)
+    settle_s: float = setting(0.1, "Time in s that the blade needs to open or close.", ge=0)
 
 
 class FoundShutter(Section):

@@ -74,13 +74,15 @@ class _Orca(Section):
     kind: str
     model: Literal["C15550-20UP", "C15550-22UP"] = setting(
         "C15550-20UP",
-        "Model of the camera: ORCA-Quest, or ORCA-Quest 2, whose mode ultra_quiet is five times as fast. Plans "
-        "and simulations use the timing of this model.",
+        "Model of the camera: C15550-20UP is the ORCA-Quest, C15550-22UP the ORCA-Quest 2. The readout ultra_quiet "
+        "of the ORCA-Quest 2 is five times as fast as that of the ORCA-Quest. Plans and simulations use the timing "
+        "of this model.",
     )
     roi: Roi | None = setting(None, "null: the full sensor, 2304 x 4096.")
     binning: Literal[1, 2, 4] = 1
     readout: Literal["standard", "ultra_quiet", "photon_number"] = setting(
-        "standard", "photon_number: the camera counts photoelectrons, at the speed of ultra_quiet."
+        "standard",
+        "photon_number: pixel values are numbers of photoelectrons; this readout takes as long as ultra_quiet.",
     )
     trigger_polarity: Literal["positive", "negative"] = setting(
         "positive",
@@ -101,10 +103,12 @@ class DcamOrca(section_of("DcamOrcaKeys", _Orca, declared(DcamOptions))):  # typ
     kind: Literal["dcam"]
     library: str | None = setting(None, "Path of the DCAM-API library; null: the installed one.")
     index: int = setting(0, "Number of the camera to use (counted from 0), if DCAM finds several cameras.", ge=0)
-    link: Literal["usb3", "coaxpress"] = setting("usb3", "USB3 transfers 17.7 full frames per second, CoaXPress 120.")
+    link: Literal["usb3", "coaxpress"] = setting(
+        "usb3", "USB3 transfers 17.7 full frames per second; CoaXPress transfers 120 full frames per second."
+    )
     cool_s: float = setting(
         0.0,
-        "Longest time for which a scan waits, before it starts, until the sensor is cold; 0: the scan does not wait.",
+        "Longest time in s that a scan waits before its start until the sensor is cold; 0: the scan does not wait.",
         ge=0,
         le=1e6,
     )

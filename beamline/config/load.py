@@ -39,7 +39,7 @@ AnySection = TypeVar("AnySection", bound=Section)
 NO_LIVE = ("recon.live=false", "scan.decide=off")
 """Overrides of a run without a reconstruction."""
 
-NO_DECISIONS = "scan.decide {} needs a live reconstruction, and this scan has none, so the scan follows its plan."
+NO_DECISIONS = "The scan follows its plan, because it has no live reconstruction, which scan.decide {} needs."
 """Message to the operator of a run without a reconstruction, if the scan would otherwise make decisions."""
 
 

@@ -35,7 +35,8 @@ class SampleSection(Section):
     description: str = ""
     diameter_mm: float | None = setting(
         None,
-        "Diameter of the smallest circle about the rotation axis that contains the whole sample; null: not known.",
+        "Diameter in mm of the smallest circle about the rotation axis that contains the whole sample; null: not "
+        "known.",
         gt=0,
         le=1e3,
     )
@@ -128,7 +129,7 @@ class TargetSection(Section):
         gt=0,
         le=100,
     )
-    seconds: Seconds | None = setting(None, "Longest time from the first frame to the last flats and darks.")
+    seconds: Seconds | None = setting(None, "Longest time in s from the first frame to the last flats and darks.")
     dose: float | None = setting(
         None,
         "Largest dose of the scan (exposures with beam on the sample), as a fraction of the dose of the whole plan.",
@@ -143,8 +144,8 @@ class StatesSection(Section):
     count: int = setting(doc="Number of states.", ge=2, le=1000)
     every_s: Seconds | None = setting(
         None,
-        "Time from the start of one state to the start of the next one. A state that takes longer delays the next one. "
-        "null: each state after the first waits for `beamline resume`, from a terminal or a script.",
+        "Time in s from the start of one state to the start of the next state. A state that takes longer delays the "
+        "next state. null: each state after the first waits for `beamline resume`, from a terminal or a script.",
     )
     references: Literal["first", "each"] = setting(
         "first",
@@ -158,8 +159,8 @@ class ScanSection(Section):
     angles: AnglesSection
     exposure_s: Seconds
     period_s: Seconds = setting(
-        doc="Time between projections. This time sets the speed of a fly scan, and the shortest time per frame of a "
-        "step scan."
+        doc="Time in s between projections. This time sets the speed of a fly scan, and the shortest time per frame "
+        "of a step scan."
     )
     frames_per_view: int = setting(
         1,
@@ -168,11 +169,11 @@ class ScanSection(Section):
         ge=1,
         le=1000,
     )
-    settle_s: float = setting(0.1, "Settling time after each move of a step scan.", ge=0, le=1e6)
+    settle_s: float = setting(0.1, "Settling time in s after each move of a step scan.", ge=0, le=1e6)
     warm_up_s: float = setting(
         0.0,
-        "Time for which the scintillator is exposed to the beam before frames are taken, each time the shutter opens. "
-        "(A warm scintillator is brighter.)",
+        "Time in s for which the scintillator is exposed to the beam before frames are taken, each time the shutter "
+        "opens. (A warm scintillator is brighter.)",
         ge=0,
         le=1e6,
     )
@@ -202,8 +203,8 @@ class ScanSection(Section):
     )
     offset_views: int = setting(
         0,
-        "For a sample wider than the field of view: number of angles at which the sample is stepped "
-        "across the beam after the projections, until all of it was measured.",
+        "For a sample wider than the field of view: number of angles at which the stage steps the sample across the "
+        "beam, after the other projections, so that frames cover its whole width. 0: no such frames.",
         ge=0,
         le=100,
     )
@@ -219,8 +220,8 @@ class ScanSection(Section):
     target: TargetSection = TargetSection(quality_db=1.0)
     wait_s: float = setting(
         30.0,
-        "Longest time for which the scan waits for a prediction after a pass, and then again for the decision "
-        "of the operator.",
+        "Longest time in s that the scan waits for a prediction after a pass, and again for the decision of the "
+        "operator.",
         ge=0,
         le=3600,
     )
@@ -241,7 +242,7 @@ class ScanSection(Section):
 
 
 class OpticsSection(Section):
-    pixel_size_um: float = setting(doc="Size of an unbinned pixel at the sample.", gt=0, le=1e6)
+    pixel_size_um: float = setting(doc="Size in µm of an unbinned pixel at the sample.", gt=0, le=1e6)
     energy_kev: float | None = setting(None, gt=0, le=1e6)
     distance_mm: float | None = setting(None, "Distance from sample to detector.", ge=0, le=1e7)
     axis_col: Column | None = setting(
@@ -255,7 +256,9 @@ class OpticsSection(Section):
         le=1e12,
     )
     light_path: LightPath | None = setting(
-        None, "Efficiency from X-ray photons to photoelectrons, for `beamline tune`; null: not known."
+        None,
+        "Optics between sample and sensor, from which `beamline tune` computes photoelectrons per X-ray "
+        "photon; null: not known.",
     )
 
 
@@ -281,13 +284,13 @@ class ReconSection(Section):
     )
     method: MethodName = setting(
         DEFAULT,
-        "r2 makes a volume that grows during the scan; all other methods need the whole scan. auto: the method "
-        "is chosen as by `beamline recon`.",
+        "r2 makes a volume that grows during the scan; all other methods need the whole scan. auto: the program "
+        "chooses the method after the scan, as `beamline recon` does.",
     )
     seconds: Seconds = setting(
         1800.0,
-        "Time limit for the fit after the last projection. null: no time limit; the fit takes as many steps as for a "
-        "finished scan, and needs more time on a busy computer.",
+        "Time limit in s for the fit after the last projection. null: no time limit; the fit takes as many steps as "
+        "for a finished scan, and needs more time on a busy computer.",
     )
     reference: str | None = setting(
         None,
@@ -348,11 +351,11 @@ class Config(Section):
             unreal = ", ".join(name for name, value in simulated.items() if value)
             real = ", ".join(name for name, value in simulated.items() if not value)
             few_simulated = 2 * sum(simulated.values()) <= len(simulated)
-            odd = next(name for name, value in simulated.items() if value is few_simulated)
+            odd_one = next(name for name, value in simulated.items() if value is few_simulated)
             raise ValueError(
-                f"devices.{odd}: simulated and real devices cannot be mixed: {unreal} simulated, {real} "
-                "real. Make all of them simulated or none. `beamline scan CONFIG --rehearse` runs a "
-                "configuration for real devices with simulated ones"
+                f"devices.{odd_one}: simulated and real devices cannot be mixed, but {unreal} simulated and {real} "
+                "real. Make all devices real or all devices simulated. `beamline scan CONFIG --rehearse` runs a "
+                "configuration for real devices with simulated devices"
             )
         if any(simulated.values()) and self.simulation is None:
             raise ValueError(
@@ -378,8 +381,8 @@ class Config(Section):
             )
         if n > 1 and self.monitor.retake:
             raise ValueError(
-                f"scan.frames_per_view {n}: set monitor.retake to false, because a frame with an alarm is "
-                "left out of the mean of its projection, so nothing is taken again"
+                f"scan.frames_per_view {n}: set monitor.retake to false. If a projection is the mean of several "
+                "frames, a frame with an alarm is left out of the mean and is not taken again"
             )
         return self
 
@@ -392,8 +395,8 @@ class Config(Section):
             raise ValueError("scan.energies and scan.states exclude each other; give one of them")
         if self.scan.state is not None and self.scan.state > (self.scan.states.count if self.scan.states else 0):
             raise ValueError(
-                f"scan.state {self.scan.state} needs scan.states with a count of at least this number; leave out "
-                "scan.state, because the series sets it"
+                f"scan.state {self.scan.state} is larger than the number of states in scan.states; leave out "
+                "scan.state, because the program sets this number in a series of states"
             )
         if self.scan.states is not None and self.scan.states.references == "first" and self.scan.darks.at is Place.END:
             raise ValueError(
@@ -411,19 +414,24 @@ class Config(Section):
         scan, recon, angles = self.scan, self.recon, self.scan.angles
         interlaced = isinstance(angles, InterlacedAngles) and angles.passes > 1
         needs = {
-            "a single scan, not a series; set scan.energies to null": scan.energies is None,
-            "a single scan, not a series; set scan.states to null": scan.states is None,
+            "a single scan, but scan.energies makes a series; set scan.energies to null": scan.energies is None,
+            "a single scan, but scan.states makes a series; set scan.states to null": scan.states is None,
             "a live volume; set recon.live to true": recon.live,
-            "a volume that grows during the scan; set recon.reference to null": recon.reference is None,
-            "a volume that grows during the scan; set recon.method to r2": streams(recon.method),
-            "passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or in a step scan set "
-            "scan.pass_views (for example 60)": 0 < scan.pass_views < getattr(angles, "views", math.inf)
+            "a volume that grows during the scan, not one with a reference; set recon.reference to null": (
+                recon.reference is None
+            ),
+            "a volume that grows during the scan, which only r2 makes; set recon.method to r2": streams(recon.method),
+            "a scan in several passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or in a step scan "
+            "set scan.pass_views (for example 60)": 0 < scan.pass_views < getattr(angles, "views", math.inf)
             if scan.mode is Mode.STEP
             else interlaced,
         }
         if scan.decide != "off" and not all(needs.values()):
             lacking = next(need for need, met in needs.items() if not met)
-            raise ValueError(f"scan.decide {scan.decide} needs {lacking}; with off the scan follows its plan")
+            raise ValueError(
+                f"scan.decide {scan.decide} needs {lacking}; or set scan.decide to off, so that the "
+                "scan follows its plan"
+            )
         return self
 
     @model_validator(mode="after")

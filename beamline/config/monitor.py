@@ -21,7 +21,7 @@ from recon.base.setting import Setting, setting
 def _no_checks(retake: bool | tuple[str, ...]) -> str:
     """The fault of a list of names of checks; "" if all names are known."""
     wrong = () if isinstance(retake, bool) else [name for name in retake if name not in BY_NAME]
-    return f"{unknown('check', wrong[0], BY_NAME)}; expected a list of these, true or false" if wrong else ""
+    return f"{unknown('check', wrong[0], BY_NAME)}; expected true, false, or a list of names of checks" if wrong else ""
 
 
 class MonitorBase(Section):
@@ -37,7 +37,7 @@ class MonitorBase(Section):
         "true: after the last projection, projections with an alarm or without a frame are taken again, once. A "
         "list of checks: projections with a warning of these checks are also taken again.",
     )
-    retake_share: float = setting(0.25, "Largest share of the projections that is taken again.", gt=0, le=1)
+    retake_share: float = setting(0.25, "Largest fraction of the projections that the scan takes again.", gt=0, le=1)
 
     @property
     def retaken_warnings(self) -> frozenset[str]:

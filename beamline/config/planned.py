@@ -111,6 +111,9 @@ def offset_places(config: Config) -> tuple[float, ...]:
     places = tuple(0.9 * field * step for step in range(-n, n + 1) if step)
     if isinstance(mover, StageMover):
         mover.refuse_unreachable(
-            {f"the position for an offset of {mm:.4g} mm,": mover.in_deg + mm / per_unit for mm in places}
+            {
+                f"the position of the sample mover for an offset of {mm:.4g} mm,": mover.in_deg + mm / per_unit
+                for mm in places
+            }
         )
     return places

@@ -47,9 +47,8 @@ class Section(BaseModel):
                 raise ValueError(f"{name} is {str(value).lower()} (YAML reads yes, no, on and off as true and false)")
             if isinstance(value, str) and name not in SEVERAL_LINES and (lowest := min(value, default=" ")) < " ":
                 raise ValueError(
-                    f"{name} is {value!r}, with the control character {lowest!r}. In double quotes a "
-                    "backslash starts such a character; write the text without quotes, or in single "
-                    "quotes"
+                    f"{name} is {value!r}, with the control character {lowest!r}. In double quotes a backslash "
+                    "starts a control character; write the text without quotes, or in single quotes"
                 )
         return data
 

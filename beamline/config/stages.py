@@ -56,8 +56,8 @@ class StageSection(Section):
     kind: str
     port: Port = setting(
         doc=(
-            "Address of the controller. For a simulated controller write sim:// and the kind, if this kind can be "
-            "simulated. The simulated controller uses all other settings given here."
+            "Address of the controller. sim:// followed by the kind of the stage: a simulated controller, if this "
+            "kind can be simulated. The simulated controller uses all other settings of this section."
         )
     )
 

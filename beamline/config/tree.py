@@ -30,8 +30,8 @@ _LONGEST, _MOST, _DEEPEST, _DIGITS = 2**18, 20_000, 64, 500
 """Limits for a YAML text: number of characters, of values (counted as often as aliases repeat them), of nested groups,
 and of digits of a number."""
 _TOO_MUCH = (
-    f"the settings are too large: at most {_LONGEST} characters, {_MOST} values, {_DEEPEST} "
-    f"nested groups and numbers of {_DIGITS} digits. Nothing was started."
+    f"the settings are too large: at most {_LONGEST} characters, {_MOST} values, {_DEEPEST} groups inside each other "
+    f"and {_DIGITS} digits in a number are allowed. Nothing was started."
 )
 _QUOTED = re.compile(r"""(?m)"(?:\\.|[^"\\])*"|'[^']*'|(?:^|(?<=\s))#.*$""")  # and the same for remarks
 # one bracket after the other; PyYAML needs a second for a thousand of them
@@ -99,7 +99,9 @@ def _read(text: str, name: str) -> Tree:
             f"{name}: the file is empty; `beamline config init` prints a complete example. Nothing was started."
         )
     if not isinstance(data, dict):
-        raise ConfigError(f"{name}:1: has no `key: value` lines; `beamline config init` prints a complete example.")
+        raise ConfigError(
+            f"{name}:1: the file has no `key: value` lines; `beamline config init` prints a complete example."
+        )
     for old, new in RENAMED.items():
         group = data.get(old[0])
         if isinstance(group, dict) and old[1] in group and new not in group:
@@ -138,7 +140,10 @@ def yaml_faults(text: str, name: str) -> Iterator[type[Any]]:
     try:
         yield _fitting_loader(text, name)
     except RecursionError:
-        raise ConfigError(f"{name}: a value contains itself. Nothing was started.") from None
+        raise ConfigError(
+            f"{name}: a list or a group contains itself through a YAML alias (*). Write its contents "
+            "out. Nothing was started."
+        ) from None
     except (yaml.YAMLError, *YAML_FAULTS) as error:
         line, what = _line_and_fault(error, text)
         place, fault = f"{name}:{line}" if line and "\n" in text else name, f"this is not YAML ({what})"
@@ -189,13 +194,13 @@ def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
         (is_quote and "end of stream" in problem, f"the {opened} of this line is never closed"),
         (is_open, f"the {opened} of this line is never closed"),
         ("'\\t'" in problem and not this[: mark.column].strip(), "this line begins with a tab; indent it with spaces"),
-        (quoted, "text continues after a closing quote; write a quote that belongs to the text twice"),
+        (quoted, "text follows after the closing quote; to write a quote inside quoted text, write the quote twice"),
         ("cannot start any token" in problem, f"a value begins with {this[mark.column :][:1]!r}; put it in quotes"),
         ("escape" in problem, "in double quotes, a backslash starts a special character; use single quotes"),
         (opened in ("*", "&") or "alias" in problem, "text that begins with * or & needs quotes"),
         (this[mark.column :][:1] in ("!", "=") or "tag" in problem, _TAGGED),
         ("unhashable" in problem, "a key of this line is a list or a group; keys must be text"),
-        ("another document" in problem, "a second document begins here; settings must be one document"),
+        ("another document" in problem, "a second YAML document begins here; the settings must be a single document"),
         (of_key and _NO_SPACE.match(this), "a space is missing after the colon of this line"),
         (of_key and _NO_SPACE.match(above), "a space is missing after the colon of the line above"),
         (of_key and ": " in this[: mark.column], "a colon is missing, or a value that contains a colon needs quotes"),
@@ -222,7 +227,7 @@ def _locate(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, st
         keys, line = (*path, str(key.value) if of_keys else index), key.start_mark.line + 1
         if keys in origins:
             full, before = ".".join(map(str, keys)), origins[keys].rpartition(":")[2]
-            fault = f"{full} appears twice (also in line {before}); keep one"
+            fault = f"{full} appears twice (also in line {before}); remove one of the two lines"
             raise ConfigError(f"{name}:{line}: {fault}. Nothing was started.", [(f"{name}:{line}", fault)])
         origins[keys] = f"{name}:{line}"
         _locate(child, keys, name, origins)
@@ -273,15 +278,18 @@ def override(
     return Tree(data, origins)
 
 
-_OWN_VIEWS = "Every reconstruction of 25 projections or more compares its projections with the volume"
+_OWN_VIEWS = (
+    "This key is not needed: every reconstruction of at least 25 projections compares its projections with the volume"
+)
 REMOVED = {
     "monitor.model": _OWN_VIEWS,
     "monitor.policy.model": _OWN_VIEWS,
-    "monitor.dark.light": "references.light_in_darks is the share of the flats' intensity from which on darks count "
-    "as exposed to the beam",
-    "recon.stop_when": "scan.decide: do with scan.target: {quality_db: 0.5} ends a scan when all projections still to "
-    "come would add at most 0.5 dB",
-    "scan.return_views": "The check `opposite` shows motion of the sample, from projections 180° apart",
+    "monitor.dark.light": "Use references.light_in_darks instead: darks count as exposed to the beam if their "
+    "intensity is at least this fraction of the intensity of the flats",
+    "recon.stop_when": "Use `scan.decide: do` with `scan.target: {quality_db: 0.5}` instead: the scan ends when all "
+    "remaining projections together would improve the PSNR by at most 0.5 dB",
+    "scan.return_views": "This key is not needed: the check `opposite` finds motion of the sample by comparing "
+    "projections 180° apart",
 }
 """Keys of 1.0.0 that were removed, each with a sentence on its replacement."""
 _ADVICE = "A configuration for real devices runs unchanged with simulated ones: `beamline scan CONFIG --rehearse`"

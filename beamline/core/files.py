@@ -235,7 +235,8 @@ def refuse_existing(path: Path) -> None:
         )
     if not path.parent.is_dir():
         raise DataError(
-            f"The folder {path.parent} does not exist, so {path.name} cannot be written there. Create it first."
+            f"The folder {path.parent} does not exist, so {path.name} cannot be written there. Create this folder "
+            "first."
         )
 
 
@@ -245,8 +246,8 @@ def refuse_not_utf8(path: Path | str) -> None:
         str(Path(path).absolute()).encode()
     except UnicodeEncodeError as error:
         raise DataError(
-            f"The path {path} contains bytes that are not UTF-8, so no result could state its name. Rename the file or "
-            "folder. Nothing was read."
+            f"The path {path} contains bytes that are not UTF-8, and the results must state this path in UTF-8. "
+            "Rename the file or folder. Nothing was read."
         ) from error
 
 

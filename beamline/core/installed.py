@@ -45,7 +45,7 @@ _DISTRIBUTIONS = {
     "zlib_ng": "zlib-ng",
 }
 _IMPORTERS = ("importlib", "_frozen_importlib", "_frozen_importlib_external")
-_WITHOUT = {"torch": " Without it, use -m fbp, -m fista-tv or -m auto."}
+_WITHOUT = {"torch": " Methods that work without torch: -m fbp, -m fista-tv, -m auto."}
 
 
 def package_problem(home: str) -> str:

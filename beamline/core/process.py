@@ -53,8 +53,9 @@ def python() -> str:
     if program := os.environ.get(PYTHON) or next(ours, None):
         return program
     raise NoPythonError(
-        f"Set {PYTHON} to a Python that has splatline, such as C:/Python313/python.exe: Python runs inside another "
-        f"program here (sys.executable is {sys.executable!r}), and no stand-alone Python was found in {sys.prefix}"
+        f"Set the environment variable {PYTHON} to a Python that has splatline, such as C:/Python313/python.exe. The "
+        f"reason: Python runs inside another program here (sys.executable is {sys.executable!r}), and no stand-alone "
+        f"Python was found in {sys.prefix}"
     )
 
 

@@ -80,7 +80,7 @@ def _of_reconstruction(event: Event) -> str | None:
             views = count(event.n_views, "projection")
             return f"{event.method} {again}: {views}, rotation axis at column {event.axis_col:.2f}"
         case TrialsStarted(file, trials=trials, by=by):
-            return f"Starting {count(trials, 'trial')} of {file}; the quality of each is measured by {by}"
+            return f"Starting {count(trials, 'trial')} of {file}; the quality of each volume is measured by {by}"
         case TrialDone():
             return _trial(event)
         case SnapshotWritten(path, n_views=n_views):
@@ -194,7 +194,10 @@ def _decision(chosen: NextChosen) -> str:
         return decision
     predicted = "" if chosen.predicted is None else f"predicted {chosen.predicted:+.2f} dB, "
     ends = "" if None in (low := chosen.gained_low, high := chosen.gained_high) else f" ({low:.2f} to {high:.2f})"
-    return f"{decision.rstrip('.')}. Result of an earlier choice: {predicted}measured {chosen.gained:+.2f} dB{ends}"
+    return (
+        f"{decision.rstrip('.')}. Improvement of the PSNR by an earlier choice: {predicted}measured "
+        f"{chosen.gained:+.2f} dB{ends}"
+    )
 
 
 def _missing(block: BlockDone) -> str | None:
@@ -256,7 +259,13 @@ def while_it_works(sink: Sink, others: Sink) -> Sink:
                 raise  # Ctrl-C
             works = False
             why = f"{type(error).__name__}: {error}"
-            others(Warned(f"An output for progress or logs failed and is no longer used: {why}", time=event.time))
+            others(
+                Warned(
+                    "The work continues, but one of the outputs for progress or logs failed and gets no more "
+                    f"messages: {why}",
+                    time=event.time,
+                )
+            )
 
     return send
 

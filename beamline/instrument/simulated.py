@@ -179,10 +179,10 @@ def scene_of(config: Config, energy: float | None = None) -> Scene:
     folder = config_folder() if isinstance(stated_scene, dict) else (config_folder() / stated_scene).parent
     mapping = scene_mapping(config)
     if energy is not None and isinstance(beam := mapping.get("beam"), dict):
-        if wide := [name for name in ("spectrum", "tube") if beam.get(name) is not None]:
+        if wide_band_key := next((name for name in ("spectrum", "tube") if beam.get(name) is not None), ""):
             raise ConfigError(
-                f"set energy_kev in simulation.scene.beam instead of {wide[0]}, because a monochromator "
-                "gives a single energy. Nothing was started."
+                f"simulation.scene.beam: set energy_kev instead of {wide_band_key}, because a monochromator gives a "
+                "single energy. Nothing was started."
             )
         mapping = mapping | {"beam": beam | {"energy_kev": energy}}
     try:

@@ -87,7 +87,8 @@ class BeamCheck(Logged):
         if abs(score) <= self.drift:
             return None
         level, limit = (Level.ALARM, self.dip) if abs(score) > self.dip else (Level.WARN, self.drift)
-        advice = f"Usually nothing to do: this flat is {_size(score)} than the flats before. {REMEDY}"
+        change_in_words = _size(score)
+        advice = f"Usually nothing to do: this flat is {change_in_words} than the flats before. {REMEDY}"
         return Flag(self.name, level, row, score, limit, advice)
 
     def _dip(
@@ -107,8 +108,9 @@ class BeamCheck(Logged):
         if abs(score) <= limit or state.dipping >= PATIENCE:
             usual = level if state.dipping >= PATIENCE else state.usual + MEMORY * (level - state.usual)
             return replace(state, usual=usual, dipping=0), None
+        change_in_words = _size(score)
         advice = (
-            f"Check ring current, slits and filters, and take new flats: this projection is {_size(score)} than the "
+            f"Check ring current, slits and filters, and take new flats: this projection is {change_in_words} than the "
             "projections before."
         )
         return replace(state, dipping=state.dipping + 1), Flag(self.name, Level.ALARM, row, score, limit, advice)
@@ -133,7 +135,8 @@ class BeamCheck(Logged):
             return CheckResult(replace(state, drifting=0, flagged_drift=0.0))
         # a drift that continues does not make the projection worse
         level = Level.INFO if state.flagged_drift else Level.WARN
-        advice = f"Usually nothing to do: air is {_size(score)} than in the flats. {REMEDY}"
+        change_in_words = _size(score)
+        advice = f"Usually nothing to do: air is {change_in_words} than in the flats. {REMEDY}"
         flag = Flag(self.name, level, row, score, self.drift, advice)
         return CheckResult(replace(state, drifting=0, flagged_drift=score), flag)
 

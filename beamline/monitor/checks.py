@@ -51,7 +51,9 @@ def _all(ours: tuple[Check, ...]) -> Registry[Check]:
         nonlocal found
         check = kind()
         if check.name != name:
-            raise ValueError(f"the name of its class is {check.name!r}; expected the name of the entry point")
+            raise ValueError(
+                f"the class of this check has the name {check.name!r}; expected the name of its entry point"
+            )
         _ = check.policy, check.unit, check.meaning, check.start(), fields(check)
         found = _distinct(*found, check)
         return check

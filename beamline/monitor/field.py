@@ -118,8 +118,8 @@ class FieldOfViewCheck(Logged):
             "axis: centre it."
         ) * (entered and len(cut) == 1)
         advice = (
-            f"{beyond_the_field(cut)}{other_side} This has three effects: the check `mass` is switched off, slow "
-            "floaters are not detected, and reconstructions are too bright at the rim."
+            f"{beyond_the_field(cut)}{other_side} The sample beyond the edge has three effects: the check `mass` is "
+            "switched off, slow floaters are not detected, and reconstructions are too bright at the rim."
         )
         rows, last = grid.shape[0] * grid.cell, grid.right + 1
         first = grid.left if left >= right else max(last - 2, 0)
@@ -170,9 +170,16 @@ class MassCheck(Logged):
     )
 
     warn: float = setting(
-        0.03, "relative change of the total absorption above which projections count as different", ge=0
+        0.03,
+        "relative change of the total absorption above which a projection counts as different from the first "
+        "projections",
+        ge=0,
     )
-    frames: int = setting(3, "number of consecutive different projections after which there is a warning", ge=1)
+    frames: int = setting(
+        3,
+        "number of projections in a row, all different from the first projections, after which there is a warning",
+        ge=1,
+    )
 
     start = MassState
 
@@ -292,9 +299,9 @@ class PixelsCheck(Logged):
         level = Level.WARN if score > self.warn else Level.INFO
         named = ", ".join(f"({row}, {col})" for row, col in zip(rows[:NAMED_PIXELS], cols[:NAMED_PIXELS], strict=True))
         advice = (
-            f"Dead pixels: {dead.size}, at (row, column) {named}{' ...' if dead.size > NAMED_PIXELS else ''}. They are "
-            "dark in the flats, although their neighbours are not. Each would make a ring in its slice; `beamline "
-            "recon` replaces them with their neighbours."
+            f"Dead pixels: {dead.size}, at (row, column) {named}{' ...' if dead.size > NAMED_PIXELS else ''}. These "
+            "pixels are dark in the flats, although their neighbours are not. Each dead pixel would make a ring in "
+            "its slice; `beamline recon` replaces them with their neighbours."
         )
         region = int(rows.min()), int(rows.max()) + 1, int(cols.min()), int(cols.max()) + 1
         return Flag(self.name, level, frame.index, score, self.warn, advice, region)

@@ -130,7 +130,11 @@ class TimingCheck(Logged):
     unit: ClassVar[str] = "trigger periods"
     meaning: ClassVar[str] = "the frame came early or late (fly scans)"
 
-    warn: float = setting(0.25, "largest time, in periods, by which a frame may be early or late", ge=0)
+    warn: float = setting(
+        0.25,
+        "largest time by which a frame may be early or late, as a fraction of the time between two projections",
+        ge=0,
+    )
 
     start = TimingState
 
@@ -237,7 +241,9 @@ class LostCheck:
     meaning: ClassVar[str] = "the beam is gone"
     policy: ClassVar[Policy] = Policy.STOP
 
-    alarm: float = setting(0.5, "loss of intensity from which on the beam counts as lost, as a fraction", ge=0.5, le=1)
+    alarm: float = setting(
+        0.5, "the beam counts as lost if the intensity falls by at least this fraction", ge=0.5, le=1
+    )
 
     start = LostState
 

@@ -209,9 +209,10 @@ class MotionCheck(Logged):
         elif abs(turn) > limit_turn:
             score, limit = turn, limit_turn
             advice = (
-                "Compare the encoder of the stage with the plan: the rotation of the sample between two frames differs "
-                f"from one step by {turn:+.1f} steps. Triggers were lost, the stage slipped, or the sample turned on "
-                "its holder. `beamline recon` uses only the longer part of the scan, either before or after this jump."
+                "Compare the encoder of the stage with the plan: between two frames the sample rotated by "
+                f"{turn:+.1f} angular steps more (+) or less (-) than planned. Triggers were lost, the stage "
+                "slipped, or the sample turned on its holder. `beamline recon` uses only the longer part of the "
+                "scan, either before or after this jump."
             )
         else:
             return None

@@ -97,13 +97,16 @@ class OppositeCheck(Logged):
     name: ClassVar[str] = "opposite"
     bit: ClassVar[int] = 15
     unit: ClassVar[str] = "pixels"
-    meaning: ClassVar[str] = "compared with the opposite projection, or with a repetition, the sample moved or changed"
+    meaning: ClassVar[str] = (
+        "the sample moved or changed: the projection differs from the opposite projection, or "
+        "from an earlier projection at the same angle"
+    )
 
     warn: float = setting(0.5, "largest allowed motion or change of the sample, in pixels", ge=0)
     changed: float = setting(
         1.0,
-        "change of parts of the sample, in pixels: the shift of the whole sample that would change the projection as "
-        "much",
+        "largest allowed change of the shape of the sample, in pixels: a shift of the whole sample by this distance "
+        "would change the projection as much",
         ge=0,
     )
     axis: float = setting(1.0, "largest allowed distance of the axis from the stated position, in pixels", ge=0)
@@ -203,9 +206,9 @@ class OppositeCheck(Logged):
         if fit.unsure or flag is not None or not first or stated is None or abs(axis - stated) <= limit:
             return CheckResult(state, flag)
         advice = (
-            f"Check the rotation axis: the opposite frames {earlier.view.index} and {view.index} show it at column "
-            f"{axis:.1f}, but the scan states {stated:.1f}. Either the stated axis is wrong, or the sample moved by "
-            "twice the difference."
+            f"Check the rotation axis: the opposite frames {earlier.view.index} and {view.index} show the axis at "
+            f"column {axis:.1f}, but the scan states column {stated:.1f}. Either the stated column is wrong, or the "
+            "sample moved between the two frames, by twice the difference of the columns."
         )
         return CheckResult(state, Flag(self.name, Level.INFO, view.index, axis - stated, self.axis, advice))
 
@@ -223,8 +226,8 @@ class OppositeCheck(Logged):
             f"the sample moved by {fit.across:+.1f} px horizontally and {fit.down:+.1f} px vertically"
             if moved > limits[0]
             else (
-                f"the sample changed its shape: it shrank, bent or lost something. The frames differ as much as if it "
-                f"had moved by {fit.remainder:.1f} px"
+                "the sample changed its shape: it shrank, bent or lost something. The frames differ as much as if "
+                f"the sample had moved by {fit.remainder:.1f} px"
             )
         )
         advice = (

@@ -84,7 +84,10 @@ class ReferenceLimits:
     uneven: float = setting(0.1, "largest allowed relative change of the intensity between flats of a group", gt=0)
     unlit: float = setting(0.5, "largest allowed fraction of a flat without beam", gt=0, le=1)
     light_in_darks: float = setting(
-        0.2, "largest allowed level and variance of darks, as fractions of those of flats", gt=0, lt=1
+        0.2,
+        "largest allowed level and variance of darks, as fractions of the level and the variance of flats",
+        gt=0,
+        lt=1,
     )
 
 
@@ -231,9 +234,9 @@ def _dimmer_than_views(evidence: Evidence, limits: ReferenceLimits) -> Iterator[
         share = evidence.intensity_of(group) / evidence.intensity_of(views)
         if share < limit and all(flat.exposure > 0 for flat in group):
             yield BadFrames(group, share, limit, (
-                f"they have {share:.2%} of the intensity of the projections (limit {limit:.0%}), but a sample can only "
-                "absorb. During these flats the beam was lost or a filter was in the beam, or the stated exposure is "
-                "wrong."
+                f"these flats have only {share:.2%} of the intensity of the projections (limit {limit:.0%}), but a "
+                "sample can only absorb. During these flats the beam was lost or a filter was in the beam, or the "
+                "stated exposure is wrong."
             ))  # fmt: skip
 
 
@@ -260,7 +263,7 @@ def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
         if far.any():
             n = lights_in_turn(levels)
             why = f"{n} thresholds, exposures or energies alternate" if n else "the beam is unstable"
-            sentence = f"their intensity differs by {changed:.0%} {how} (limit {limit:.0%}): {why}."
+            sentence = f"the intensity of these flats differs by {changed:.0%} {how} (limit {limit:.0%}): {why}."
             yield BadFrames(group if whole else odd, changed, limit, sentence)
         elif odd:
             yield BadFrames(group if whole else odd, float(places.max()), limit, (

@@ -65,8 +65,8 @@ def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[BadFrames]
         if others and (nearest_view := _nearest_view(image, others, projections)) is not None:
             off, like, nearest = nearest_view
             odd.append(BadFrames(frames, off, like / LIKER, (
-                f"the sample was in the beam. In line integral, they differ by {off:.3g} from the {compared_with}, but "
-                f"only by {like:.2g} from the projection in frame {views[nearest].row}."
+                f"the sample was in the beam. In line integral, these flats differ by {off:.3g} from the "
+                f"{compared_with}, but only by {like:.2g} from the projection in frame {views[nearest].row}."
             )))  # fmt: skip
     if len(odd) < len(compared):  # otherwise the beam drifts, and each flat is similar to the projections next to it
         yield from odd
@@ -138,8 +138,8 @@ def flats_below_views(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
         if min(top, top - least, mismatch) > above.limit:
             yield BadFrames(group, top, above.limit, (
                 "the sample, or something else, was in the beam. A sample can only absorb, but projections are "
-                f"locally brighter than these flats, by {top:.3g} in line integral (limit {above.limit:.2g}). They "
-                f"are brighter than the other flats by only {max(least, 0.0):.2g}."
+                f"locally brighter than these flats, by {top:.3g} in line integral (limit {above.limit:.2g}). The "
+                f"projections are brighter than the other flats by only {max(least, 0.0):.2g}."
             ))  # fmt: skip
 
 

@@ -183,11 +183,11 @@ def _valid(answer: Any, name: str, row: int) -> CheckResult[Any]:
         and all(isinstance(number, Real) for number in numbers)
     )
     if not typed or any(len(box) != 4 for box in boxes if box is not None):
-        raise TypeError(f"a field of its flag has the wrong type: {flag!r:.300}")
+        raise TypeError(f"the check returned a flag in which a field has the wrong type: {flag!r:.300}")
     if flag.check != name or rows[0] > rows[1] or not 0 <= rows[1] <= row:  # `_from` removes rows that are too early
         raise ValueError(
-            f"its flag names the check {flag.check!r} and rows {rows[0]} to {rows[1]}; expected {name!r} and rows up "
-            f"to {row}"
+            f"the check returned a flag for the check {flag.check!r} and rows {rows[0]} to {rows[1]}; expected the "
+            f"check {name!r} and rows up to {row}"
         )
     return answer
 

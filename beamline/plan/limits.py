@@ -170,7 +170,10 @@ def violations(facts: PlanFacts) -> Iterator[str]:
         )
     for name, field in (("flats", plan.flats), ("darks", plan.darks)):
         if field.at is not Place.NONE and field.count == 0:
-            yield f"no {name}: scan.{name}.count is 0; take at least one, or set at: none if you want none"
+            yield (
+                f"no {name}: scan.{name}.count is 0; set a count of at least 1, or set scan.{name}.at to none for "
+                f"a scan without {name}"
+            )
     if plan.pass_views and plan.n_views > MOST_PASSES * plan.pass_views:
         yield (
             f"scan.pass_views {plan.pass_views} divides {plan.n_views} projections into more than {MOST_PASSES} "
@@ -221,9 +224,9 @@ def remarks(facts: PlanFacts) -> Iterator[str]:
         )
     if plan.retakes:
         yield (
-            "projections that the monitor flags (monitor.retake) are taken again after the last projection, up "
-            f"to {plan.retakes} (monitor.retake_share): {facts.retake_seconds:.0f} s and "
-            f"{size(facts.retake_bytes)} more at most"
+            f"after the last projection the scan takes up to {plan.retakes} projections again "
+            "(monitor.retake_share), if the monitor flags them (monitor.retake). These projections add at most "
+            f"{facts.retake_seconds:.0f} s and {size(facts.retake_bytes)}"
         )
     yield from _reference("flats", plan.flats, plan.exposure, "the intensity of the flats will be scaled")
     yield from _reference(
@@ -290,9 +293,10 @@ def _limits(facts: PlanFacts) -> Iterator[str]:
     slack = math.pi / facts.stage.counts_per_turn
     if low < facts.stage.low - slack or high > facts.stage.high + slack:
         taxi = f" (with {degrees(facts.views.taxi)} of run-up at each end)" if facts.views.taxi else ""
+        what_to_change = " or ".join(_ways_within(facts))
         yield (
             f"the stage would go from {degrees(low)} to {degrees(high)}{taxi}, but its limits are "
-            f"{degrees(facts.stage.low)} ... {degrees(facts.stage.high)}; {' or '.join(_ways_within(facts))}"
+            f"{degrees(facts.stage.low)} ... {degrees(facts.stage.high)}; {what_to_change}"
         )
 
 

@@ -303,9 +303,10 @@ def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
     words = [line.split("#", 1)[0].strip() for line in text.splitlines()]
     columns = [*zip(*(word.split(",") for word in words if "," in word), strict=False)]
     if any(map(are_a_count, columns)) and all(len({*column}) > 1 for column in columns):
+        last_with_comma = [word for word in words if "," in word][-1]
         raise ValueError(
-            f"it contains {[word for word in words if ',' in word][-1]!r}, which may be the number of a "
-            "projection and its angle, or an angle with a decimal comma; expected one angle per line"
+            f"the file of angles contains {last_with_comma!r}, which may be the number of a projection and its "
+            "angle, or an angle with a decimal comma; expected one angle per line"
         )
     degrees = []
     for number, (word, plain) in enumerate(zip(words, with_points(words), strict=True), start=1):

@@ -268,8 +268,8 @@ def stated_axis(source: ScanSource) -> float:
 
 def _not_found(source: ScanSource, error: Exception) -> DataError:
     return DataError(
-        f"{source.path}: no rotation axis was found: {error}. Give it with --axis COLUMN (0 is the centre "
-        "of the first column)."
+        f"{source.path}: no rotation axis was found: {error}. Give the column of the axis with --axis COLUMN (0 is "
+        "the centre of the first column)."
     )
 
 

@@ -73,7 +73,7 @@ _SURE = 4.0  # standard deviations
 # deviations
 _REPEATED, _REPEATED_SIGMAS = np.array([0.5, 0.06, 0.025, 0.03]), 6.0
 # a change of the width and of the height by the same factor
-_SCALED = ". A pixel size that differs between the projections has the same effect"
+_SCALED = ". If the pixel size differs between the two projections, the sample also seems larger or smaller"
 _COMPARED = ("higher", "lower"), ("less absorbing", "more absorbing"), ("narrower", "wider"), ("shorter", "taller")
 
 
@@ -246,16 +246,18 @@ def _steady(
     change = np.where(opposite, np.abs(levels[:, None] - levels) - _OF_LOCAL * np.maximum(local[:, None], local), -1)
     first, last = np.unravel_index(int(change.argmax()), change.shape)
     size = float(max(change[first, last], 0)) if opposite.any() else np.nan
+    earlier, later = sorted(frames[[first, last]])
+    difference = abs(levels[first] - levels[last])
     what = (
-        f"Frames {min(frames[[first, last]])} and {max(frames[[first, last]])}, 180° apart, must be mirror "
-        f"images, but they differ by {abs(levels[first] - levels[last]):.2f} in line integral"
+        f"Frames {earlier} and {later}, 180° apart, must be mirror images, but they differ by {difference:.2f} in "
+        "line integral"
     )
     outlier, odd = _out_of_line(levels, angles)
     if odd > max(_STEP_OF_LIGHT, np.nan_to_num(size)):
         size = odd
         what = (
-            f"The whole frame {frames[outlier]} is brighter or darker than its neighbours in angle: the median of its "
-            f"line integrals differs from theirs by {odd:.2f} more than the medians of other neighbours suggest"
+            f"The whole frame {frames[outlier]} is brighter or darker than the frames at neighbouring angles: the "
+            f"median of its line integrals differs from theirs by {odd:.2f} more than is usual in this scan"
         )
     sentence = (
         f"{what}, and there is no air next to the sample to correct this. Intensity, exposure, energy or "
@@ -294,17 +296,18 @@ def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: f
         most = shown.mass[odd][np.abs(shown.mass[odd]).argmax()]
         sentence = (
             f"Look at these frames: {count(int(odd.sum()), 'projection')} of {odd.size} checked "
-            f"({frames_text(frames[odd])}) {'differs' if odd.sum() == 1 else 'differ'} from the others by "
-            f"up to {most:+.1%} in total absorption, but {because}. Something else was in the beam, or the intensity "
-            f"is wrong. --views leaves projections out."
+            f"({frames_text(frames[odd])}) {'differs' if odd.sum() == 1 else 'differ'} from the others by up to "
+            f"{most:+.1%} in total absorption, but {because}. Something other than the sample was in the beam, or "
+            "the intensity is wrong. Use --views to leave these projections out."
         )
         return ConsistencyCondition("mass of the views", float(abs(most)), limit, "of the total absorption", sentence)
+    change = np.ptp(np.percentile(shown.mass, _TENTHS))
+    lowest_frame, highest_frame = frames[shown.mass.argmin()], frames[shown.mass.argmax()]
     sentence = (
-        f"The total absorption changes by {np.ptp(np.percentile(shown.mass, _TENTHS)):.0%} during the "
-        f"scan (lowest in frame {frames[shown.mass.argmin()]}, highest in frame "
-        f"{frames[shown.mass.argmax()]}), but {because}. Did the energy or the sample change, or do some "
-        "projections belong to another scan, exposure or flat field? Use --views to choose projections "
-        "that belong together (every:2 if two intensities alternate), or --volumes if the sample changes."
+        f"The total absorption changes by {change:.0%} during the scan (lowest in frame {lowest_frame}, highest in "
+        f"frame {highest_frame}), but {because}. Did the energy or the sample change, or do some projections belong "
+        "to another scan, exposure or flat field? Use --views to choose projections that belong together (every:2 "
+        "if two intensities alternate), or --volumes if the sample changes."
     )
     return ConsistencyCondition("mass of the views", float(high - low), tolerance, "of the total absorption", sentence)
 
@@ -341,12 +344,13 @@ def _fan(data: F32, view_numbers: NDArray[np.intp], geometry: Geometry) -> Consi
         "Check --cone SOD:SDD: both are in mm, and SDD is the distance from the source to the detector, "
         "not from the axis."
         if geometry.is_cone
-        else "If the beam is a cone, give --cone SOD:SDD in mm. Without it, densities and shapes are wrong."
+        else "If the beam is a cone, give --cone SOD:SDD in mm. Without these distances, densities and shapes are "
+        "wrong."
     )
     sentence = (
         f"{check} The projections contradict the stated geometry. A 360° scan measures each ray twice, from opposite "
-        f"sides. The two values agree best if the fan angle is {best_angle:.3g} degrees{away}, but it is "
-        f"{stated_angle:.3g} degrees with the stated distances."
+        f"sides. The two values agree best if the fan angle is {best_angle:.3g} degrees{away}, but the stated "
+        f"distances give a fan angle of {stated_angle:.3g} degrees."
     )
     by_axis = pitch / (geometry.sdd + geometry.sod) if geometry.is_cone else np.inf  # SDD stated from the axis
     is_by_axis = abs(math.atan(best * across) - math.atan(by_axis * across)) <= _SAME_FAN
@@ -359,38 +363,39 @@ def _fan(data: F32, view_numbers: NDArray[np.intp], geometry: Geometry) -> Consi
 
 def _across(shown: ViewMoments) -> ConsistencyCondition:
     lowest, highest = np.percentile(shown.across, _MOST_OF_THEM)
+    deviation = highest - lowest
     sentence = (
-        f"The sample or the stage moved sideways, or frames have wrong angles: the centre of mass deviates by "
-        f"{highest - lowest:.1f} columns (uncertainty {shown.across_sigma:.2g}) from the sine curve of a "
-        "rotating sample. Use --calibrate shifts or --poses to correct it, or --volumes if the sample "
-        "changes."
+        "The sample or the stage moved sideways, or frames have wrong angles: the centre of mass deviates by "
+        f"{deviation:.1f} columns (uncertainty {shown.across_sigma:.2g}) from the sine curve of a rotating sample. "
+        "Use --calibrate shifts or --poses to correct it, or --volumes if the sample changes."
     )
     tolerance = max(_ACROSS, 2 * _NOISE * shown.across_sigma)
-    return ConsistencyCondition("centre of mass on a sine", float(highest - lowest), tolerance, "columns", sentence)
+    return ConsistencyCondition("centre of mass on a sine", float(deviation), tolerance, "columns", sentence)
 
 
 def _heights(shown: ViewMoments) -> ConsistencyCondition:
     low, high = np.percentile(shown.down, _MOST_OF_THEM)
+    motion, at_first, at_last = high - low, shown.down[0], shown.down[-1]
     sentence = (
-        "Slices are blurred vertically: from projection to projection the sample moves by up to "
-        f"{high - low:.1f} rows (from {shown.down[0]:+.1f} rows in the first to {shown.down[-1]:+.1f} in "
-        f"the last; uncertainty {shown.down_sigma:.2g}). For a sample at rest, each row has the same "
-        "total absorption in all projections. Use --calibrate shifts or --poses if the sample or the "
-        "stage moved, or --volumes if the sample changes."
+        f"Slices are blurred vertically: the sample moves along the rotation axis by up to {motion:.1f} rows between "
+        f"projections ({at_first:+.1f} rows in the first projection, {at_last:+.1f} rows in the last; uncertainty "
+        f"{shown.down_sigma:.2g}). For a sample at rest, each row has the same total absorption in all projections. "
+        "Use --calibrate shifts or --poses if the sample or the stage moved, or --volumes if the sample changes."
     )
     known = np.isfinite([*shown.down, shown.down_sigma]).all()
     tolerance = max(_HALF_A_PIXEL, 2 * _NOISE * shown.down_sigma)
-    return ConsistencyCondition("mass of each row", float(high - low) if known else np.nan, tolerance, "rows", sentence)
+    return ConsistencyCondition("mass of each row", float(motion) if known else np.nan, tolerance, "rows", sentence)
 
 
 def _angles(shown: ViewMoments, angles: NDArray[np.floating]) -> ConsistencyCondition:
     span = float(np.degrees(np.ptp(angles)))
+    seen_span = span * (1 + shown.stretch)
     sentence = (
-        f"The angles seem wrong: the projections seem to cover {span * (1 + shown.stretch):.4g} degrees, "
-        f"but the stated angles cover {span:.4g} ({shown.stretch:+.1%} ± {shown.stretch_sigma:.1%}, from "
-        "the moments of their rows). Do the angles have another scale or range, are projections missing "
-        "within the scan, or did the sample move? Give the right angles with --angles FILE (degrees, one "
-        "per line), or compare slices made with different angles."
+        f"The angles seem wrong: according to the moments of their rows, the projections cover {seen_span:.4g} "
+        f"degrees, but the stated angles cover {span:.4g} degrees (difference {shown.stretch:+.1%} ± "
+        f"{shown.stretch_sigma:.1%}). Do the angles have another scale or range, are projections missing within the "
+        "scan, or did the sample move? Give the right angles with --angles FILE (degrees, one per line), or compare "
+        "slices made with different angles."
     )
     tolerance = max(_STRETCH, _SURE * shown.stretch_sigma)
     return ConsistencyCondition(
@@ -443,14 +448,14 @@ def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: fl
         words = [f"{size} {way[int(by > 0)]}" for size, way, by in zip(sizes, _COMPARED, change, strict=True)]
         if not off.max() <= worst:
             worst = float(off.max())
+            changes = ", ".join(np.array(words)[off > 1])
+            or_scaled = _SCALED if off[2] > 1 and change[2] * change[3] > 0 else ""
             sentence = (
-                f"The sample changed during the scan: frames {frames[first]} and {frames[later]} measure the "
-                "same rays at two times, and in the later one the sample is "
-                f"{', '.join(np.array(words)[off > 1])}{_SCALED if off[2] > 1 and change[2] * change[3] > 0 else ''}. "
-                "Other pairs of such frames show the same change. A single volume blurs everything that changes. Use "
-                "--volumes N "
-                "for several volumes in time, --calibrate shifts if the sample moved as a whole, or --views for "
-                "a part of the scan."
+                f"The sample changed during the scan: frames {frames[first]} and {frames[later]} measure the same "
+                f"rays at two times, and in frame {frames[later]} the sample is {changes}{or_scaled}. Other pairs of "
+                "frames of the same rays show the same change. A single volume blurs everything that changes. Use "
+                "--volumes N for several volumes in time, --calibrate shifts if the sample moved as a whole, or "
+                "--views for a part of the scan."
             )
     return ConsistencyCondition(
         "views of the same rays", worst, 1.0, "times the smallest change that is reported", sentence

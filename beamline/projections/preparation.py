@@ -79,8 +79,8 @@ class Preparation:
     ring_current: str = option(
         "--ring-current",
         "ignore",
-        "use: divide projections and flats by the ring current of each frame in the file (control/data "
-        "of NXtomo). ignore: do not.",
+        "use: divide projections and flats by the ring current of each frame in the file (control/data of NXtomo). "
+        "ignore: do not use the ring current.",
         choices=("ignore", "use"),
     )
     floor: float = 1e-4

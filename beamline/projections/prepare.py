@@ -189,9 +189,9 @@ def _corrected(
         projections = apply_in_batches(plan, used, buffer.views, buffer.batch, warn, phases.progress)
     if 2 * (n := projections.view_ids.size) < used.size:
         raise DataError(
-            f"{plan.source.path}: only {n} of {used.size} projections can be used, which are too "
-            "few for the scan. The other projections have no beam, have no finite pixel, or differ from their "
-            "checksum. Choose the usable projections with --views, or take the others again."
+            f"{plan.source.path}: only {n} of {used.size} projections can be used, less than half. The other "
+            "projections have no beam, have no finite pixel, or differ from their checksum. Choose the usable "
+            "projections with --views, or repeat the scan."
         )
     return projections
 

@@ -208,13 +208,14 @@ def flats_sentence(scan: ScanEvidence, references: References, by_current: bool)
     if scan.views_differ:
         views = scan.table.exposures[scan.table.views]
         sentences.append(
-            f"Exposure times of the projections vary from {views.min():g} to {views.max():g} s; this was corrected."
+            f"The exposure times of the projections vary from {views.min():g} to {views.max():g} s; each projection "
+            "was scaled to its exposure time."
         )
     if by_current:
         currents = 1 / current_scale(scan)[scan.table.views]
         sentences.append(
-            f"The ring current of the projections varies from {currents.min():.3f} to "
-            f"{currents.max():.3f} times its median; this was corrected."
+            f"The ring current of the projections varies from {currents.min():.3f} to {currents.max():.3f} times its "
+            "median; each projection was scaled to its ring current."
         )
     if references.dynamic is not None:
         n = len(references.dynamic.components)

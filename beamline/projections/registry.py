@@ -49,8 +49,8 @@ def registered() -> tuple[type[PrepStep], ...]:
             )
         if names_of_options & taken or not by_name.keys() >= set(step.follows):
             raise ValueError(
-                f"it has an option of another step ({names_of_options & taken}), or follows a step that "
-                f"is not one of {sorted(by_name)}"
+                f"the correction step has an option of another step ({names_of_options & taken}), or follows a step "
+                f"that is not one of {sorted(by_name)}"
             )
         taken.update(names_of_options)
         return step

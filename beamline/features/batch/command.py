@@ -178,7 +178,8 @@ def _reconstruct_row(row: BatchRow, place: Path, how: Sequence[str], sink: Sink,
     if (place / RECON).is_file():
         return replace(
             row, state="done", seconds=0.0,
-            message="made by an earlier call that ended before it wrote this row; see the report for warnings",
+            message="an earlier batch made this volume, and ended before it wrote this row; see the report of the "
+                    "volume for warnings",
         )  # fmt: skip
     try:
         with atomic_file(place) as work:
@@ -206,7 +207,8 @@ def _with_command(message: str, row: BatchRow) -> str:
     """A message of a reconstruction. If it mentions options, the command that takes these options is added."""
     named = re.search(r"(?<![\w-])-(-[a-z]|[a-z]\b)", re.sub(r"`beamline [^`]*`", "", message))
     return message + (
-        f" Give these options to `beamline recon {row.scan}`, or add them to the recipe if they apply to all scans."
+        " If the options in this message apply to all scans, add them to the recipe; otherwise give them to "
+        f"`beamline recon {row.scan}`."
         if named
         else ""
     )
@@ -235,8 +237,9 @@ def _read(folder: Path) -> list[BatchRow]:
         ]
     except ValidationError as error:
         first = error.errors()[0]
+        fault = first["msg"]
         place = f"row {int(first['loc'][0]) + 1}, {first['loc'][-1]}"
-        raise DataError(f"{path} is not a table of a batch ({place}: {first['msg']}). Nothing was changed.") from error
+        raise DataError(f"{path} is not a table of a batch ({place}: {fault}). Nothing was changed.") from error
     except (OSError, ValueError, csv.Error) as error:
         raise DataError(f"{path} is not a table of a batch ({one_line(str(error))}). Nothing was changed.") from error
 
@@ -246,7 +249,7 @@ def _refuse_names(rows: Sequence[BatchRow]) -> None:
     folded = [TABLE, RECIPE, *(row.name.casefold() for row in rows)]
     for n, row in enumerate(rows, start=2):
         if row.name != safe_name(row.name) or folded[n] in folded[:n]:
-            raise ValueError(f"{row.name!r} is not a name that this program would give to the folder of a scan")
+            raise ValueError(f"{row.name!r} is not a valid folder name for a scan, or two rows have this name")
 
 
 def _write(folder: Path, rows: Sequence[BatchRow]) -> None:
@@ -284,7 +287,7 @@ def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...])
     "--output",
     type=click.Path(path_type=Path, file_okay=False),
     required=True,
-    help="Folder for the results: a new one, or that of an earlier call with the same recipe, which is then continued.",
+    help="Folder for the results. If an earlier batch with the same recipe used this folder, that batch is continued.",
 )
 @json_option
 def batch(scans: list[Path], config: Path | None, output: Path, as_json: bool) -> None:

@@ -46,8 +46,8 @@ def ioc(runs: Path, prefix: str, bind: str, control: bool) -> None:
             "by broadcast" if bind == "0.0.0.0" else f"if EPICS_PVA_ADDR_LIST={bind} is set in their environment"
         )
         click.echo(
-            f"Publishing {prefix}ScanStatus and others at {bind}. Clients find them {discovery} (docs/page.md). Ctrl-C "
-            "ends this command, not the scan."
+            f"Publishing {prefix}ScanStatus and other process variables at {bind}. Clients find these variables "
+            f"{discovery} (docs/page.md). Ctrl-C ends this command, not the scan."
         )
         while True:
             server.look()

@@ -56,7 +56,7 @@ def volume_findings(record: ReconRecord) -> Iterator[Finding]:
     raw, there = record.raw_file, record.parameters.get("partial")
     partial = (
         f"The volume is partial: {there} are reconstructed, the other slices are empty. `beamline recon --resume` "
-        f"reconstructs these slices."
+        "reconstructs the empty slices."
     )
     early = "The reconstruction was stopped early; the file contains the volume reached by then."
     rules = (
@@ -70,7 +70,11 @@ def volume_findings(record: ReconRecord) -> Iterator[Finding]:
         ),
         (
             bool(record.parameters) and not Path(raw).exists(),
-            Finding("info", "raw-file", f"The scan from which it was reconstructed, {raw}, does not exist."),
+            Finding(
+                "info",
+                "raw-file",
+                f"The scan file from which the volume was reconstructed, {raw}, no longer exists at this path.",
+            ),
         ),
     )
     yield from (finding for broken, finding in rules if broken)
@@ -129,8 +133,8 @@ def views_lit(scan: ScanEvidence, every: bool) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "unlit",
-            f"{len(unlit)} of {checked} ({frames_text(unlit)}) had no beam: the shutter was closed, the beam was lost, "
-            f"or these frames were never written. `beamline recon` does not use such projections.{more}",
+            f"{len(unlit)} of {checked} ({frames_text(unlit)}) had no beam: the shutter was closed, the beam was "
+            f"lost, or these frames were never written. `beamline recon` does not use projections without beam.{more}",
         )
 
 
@@ -160,7 +164,8 @@ def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator
         yield Finding("error", "unreadable", sentence)
     elif progress is None and source.unreadable:
         which = f"{count(len(source.unreadable), 'frame')} cannot be read: {spans(sorted(source.unreadable))}."
-        sentence = f"{which} {next(iter(source.unreadable.values()))} `beamline recon` does not use such frames."
+        first_reason = next(iter(source.unreadable.values()))
+        sentence = f"{which} {first_reason} `beamline recon` does not use frames that cannot be read."
         yield Finding("warning", "unreadable", f"{sentence} `validate --deep` reads all frames.")
     if source.damaged:
         yield Finding(
@@ -324,7 +329,8 @@ def time_order(source: ScanSource) -> Iterator[Finding]:
         yield Finding(
             "error",
             "time-order",
-            f"The times of the frames go back {back.size} times (first: frame {back[0] + 1}, by {-step:.6g} s).",
+            f"{back.size} frames have an earlier time than the frame before them (first: frame {back[0] + 1}, by "
+            f"{-step:.6g} s).",
         )
 
 

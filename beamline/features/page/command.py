@@ -119,7 +119,7 @@ def _end(server: PageServer) -> None:
 @port_option
 @bind_option
 @click.option("--until-stdin-ends", "tethered", is_flag=True, hidden=True)
-@click.option("--open", "browse", is_flag=True, help="With --page: open it in the browser of this computer.")
+@click.option("--open", "browse", is_flag=True, help="With --page: open the list in the browser of this computer.")
 def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str, tethered: bool, browse: bool) -> None:
     """List the runs in FOLDER (default ./runs), newest first: sample, frames, state, size on the disk, flags.
 
@@ -240,7 +240,9 @@ def view(
         from beamline.features.page.in_napari import show
 
         if any(name is not None for _, name in named):
-            raise click.UsageError("--napari cannot open ::NAME; copy the array to a file of its own.")
+            raise click.UsageError(
+                "--napari cannot open FILE::NAME (one of several arrays); copy this array to a separate file."
+            )
         show([path for path, _ in named], labels)
         return
     from beamline.features.page.app import viewer  # these load HDF5 and the server

@@ -82,8 +82,8 @@ class SimulateRequest:
         "--frames",
         type=_VIEWS,
         metavar="N",
-        help="Number of projections over the range of angles of the scene, at the same speed of the stage. Default: "
-        "the number in the scene.",
+        help="Number of projections over the range of angles of the scene. The speed of the stage stays as in the "
+        "scene. Default: the number in the scene.",
     )
     out: Path | None = set_by(
         "-o",

@@ -171,10 +171,7 @@ class StudyRequest:
         type=NameChoice(get_args(Filter)),
         default="hann",
         show_default=True,
-        help=(
-            "Filter of every FBP volume: of those in the rows of the table, and of the reference volume from "
-            "all projections."
-        ),
+        help=("Filter of all FBP volumes: the compared volumes and the reference volume from all projections."),
     )
     draws: int = set_by(
         "--draws",

@@ -44,8 +44,8 @@ from recon.voxels.resolution import ViewResolution
 _LEAST_CHANGE = 0.05
 _NUMBER = re.compile(rf"[-+]?{NUMBER}")
 _NO_SCORE = (
-    "No scores: these values change the pixels or the selection of projections, so the slices cannot be "
-    "compared with the same projections."
+    "The table has no scores, because the values of this option change the pixels or the selection of projections, "
+    "so that the slices cannot be compared with the same projections."
 )
 _OTHER_VIEWS = (
     "Look at the pictures first. Each value of this option corrects the projections differently, and the score of a "

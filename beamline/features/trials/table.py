@@ -194,7 +194,9 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Iterator[tuple[str, Pict
         )
         yield "quality.png", Picture("Quality against its costs", caption, quality_plot(table))
     if labels := slices.labels():
-        caption = "The same slice by each method with its usual settings, all with the grey window of the first one."
+        caption = (
+            "The same slice by each method with its default settings, all with the grey window of the first slice."
+        )
         marks = dict[str, tuple[str, str]]()
         if table.asks_best:
             caption = (

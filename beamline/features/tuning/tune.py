@@ -102,8 +102,8 @@ class Tuning:
             ),
             (
                 "noise",
-                f"of a line integral in one projection at the advised exposure: {at_middle:.3g} (median), {at_low:.3g} "
-                "in the darkest 1 % of the projection",
+                f"{at_middle:.3g} (median) and {at_low:.3g} (darkest 1 % of the projection) in line integral, for "
+                "one projection at the advised exposure",
             ),
             (
                 "exposure",

@@ -138,12 +138,15 @@ class FloaterCheck(Logged):
         share = (crumb.last - begin) / max(crumb.last - crumb.first, 1)
         where = [_region(grid, crumb, col) for col in (crumb.col, crumb.col - track.speed * span * share)]
         cell = grid.cell
+        first_row, last_row = top * cell, below * cell - 1
+        first_frame, last_frame = after.crumbs[-1].first, crumb.last
+        speed, side = abs(track.speed) * cell, "right" if track.speed > 0 else "left"
         advice = (
-            f"Find the particle and blow it off: it crosses the field of view in rows {top * cell} ... "
-            f"{below * cell - 1}, frames {after.crumbs[-1].first} ... {crumb.last} so far, and moves "
-            f"{abs(track.speed) * cell:.1f} px per projection to the {'right' if track.speed > 0 else 'left'}. No "
-            "point of the rotating sample moves like this, so the particle is falling, floating or sitting on the "
-            "holder. `beamline recon` gives rays through the particle less weight; repeat the scan if streaks remain."
+            f"Find the particle and blow it off: it crosses the field of view in rows {first_row} ... {last_row}, in "
+            f"frames {first_frame} ... {last_frame} so far, and moves {speed:.1f} px per projection to the {side}. "
+            "No point of the rotating sample moves like this, so the particle is falling, floating or sitting on "
+            "the holder. `beamline recon` gives rays through the particle less weight; repeat the scan if streaks "
+            "remain."
         )
         flag = Flag(self.name, Level.WARN, crumb.last, track.score, self.warn, advice, where[0], begin, where[1])
         return CheckResult(after, flag)

@@ -214,12 +214,12 @@ class GhostCheck(Logged):
         rows, cols = context.grid.shape
         broad = cols / COLUMNS
         region = context.grid.region((rows - 1) / 2, (col + 0.5) * broad, rows, 2 * WIDTHS[0] * cols)
+        speed_px = abs(trail.speed) * broad * context.grid.cell
         advice = (
             "Look for something between source and detector that reflects or shadows the beam and moves with the "
             "stage: a broad shadow or reflection crosses the field of view. The shadow or reflection changes the "
-            "intensity by "
-            f"{intensity:.1%} and moves {abs(trail.speed) * broad * context.grid.cell:.0f} px per projection, faster "
-            "than any part of the sample. " + again_by(self.name)
+            f"intensity by {intensity:.1%} and moves {speed_px:.0f} px per projection, faster than any part of the "
+            "sample. " + again_by(self.name)
         )
         return CheckResult(state, Flag(self.name, level, now, intensity, limit, advice, region, trail.first))
 

@@ -81,10 +81,10 @@ class Air:
     model: str = option(
         "--air",
         "auto",
-        "Set the air of each projection to zero. columns: subtract the line through the air at both "
-        "edges. LEFT,RIGHT: the same, with this many columns of air at each edge. surface:0 to "
-        "surface:3: also subtract a polynomial of this order, fitted to all rays that miss the sample. "
-        "none: subtract nothing. auto: columns, and the surface if the projections confirm it.",
+        "Set the air of each projection to zero. columns: subtract the line through the air at both edges. "
+        "LEFT,RIGHT: as columns, with these numbers of air columns at the left and right edge. surface:0 to "
+        "surface:3: also subtract a polynomial of this order, fitted to all rays that miss the sample. none: "
+        "subtract nothing. auto: columns, and the surface if the projections confirm it.",
         parse=_model,
         metavar="auto|none|columns|LEFT,RIGHT|surface:ORDER",
     )
@@ -212,8 +212,8 @@ def without_background(
     # beam has changed.
     if order is None and fitted.level > 0 and fitted.level + levelled > 0:
         return (
-            "The background of the beam was not subtracted, because it is positive and may be weakly "
-            f"absorbing material all around the sample: {description}. If it is air, give --air "
+            "The background of the beam was not subtracted, because it is positive and may be weakly absorbing "
+            f"material all around the sample: {description}. If the sample is surrounded by air, give --air "
             f"surface:{fitted.order}."
         ), None
     if others is not None:

@@ -288,14 +288,14 @@ def require_stated(poses: ScanPoses, source: ScanSource, view_ids: I64) -> None:
         degrees = np.degrees(source.table.angles[unknown[0]])
         raise DataError(
             f"{table.path} has no pose for {unknown.size} of the {view_ids.size} projections chosen from "
-            f"{source.path} (the first: frame {unknown[0]}, at {degrees:.6g} degrees). Add the missing poses, or "
-            "choose only projections that have a pose with --views."
+            f"{source.path} (the first: frame {unknown[0]}, at {degrees:.6g} degrees). Add the missing poses, or use "
+            "--views to choose only projections that have a pose."
         )
 
 
 def _sentence(table: PoseTable, shifts: F64) -> str:
     if table.vectors is not None:
-        return f"The geometry comes from {table.path}: vectors of {count(table.keys.size, 'projection')}."
+        return f"The geometry of {count(table.keys.size, 'projection')} comes from the ASTRA vectors in {table.path}."
     across, down = np.ptp(shifts, axis=0)
     roll, tilt = np.abs(table.turns_deg).max(axis=0)
     return (

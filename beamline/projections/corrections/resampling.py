@@ -180,7 +180,8 @@ def with_tilt(
         tilt, uncertainty = _refined(scan.part(rows=None), frames, progress)
     except ValueError as error:
         raise DataError(
-            f"{source.path}: the tilt of the axis was not found: {error}. Give it with --tilt DEGREES, or omit --tilt."
+            f"{source.path}: the tilt of the axis was not found: {error}. Give the tilt with --tilt DEGREES, or omit "
+            "--tilt."
         ) from error
     if abs(tilt) > STEEPEST:
         raise DataError(

@@ -328,8 +328,8 @@ def test_the_former_name_says_what_to_use(here: Path) -> None:
     result = beamline("segment", "can.npy")
     assert result.exit_code == 2
     assert (
-        "no command 'segment' any more: use `beamline structure VOLUME` (pip install splatline-structure)."
-        in result.stderr
+        "no command 'segment', which was removed: use `beamline structure VOLUME` instead (pip install "
+        "splatline-structure)." in result.stderr
     )
 
 

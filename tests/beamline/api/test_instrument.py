@@ -182,7 +182,7 @@ def test_without_a_live_reconstruction_it_says_that_nothing_is_decided(connected
     with connected(say=said.append, **words) as instrument:
         assert instrument.scan(live=False).clean
         instrument.scan(live=False, set={"scan.decide": "off"})
-    sentence = "scan.decide do needs a live reconstruction, and this scan has none, so the scan follows its plan."
+    sentence = "The scan follows its plan, because it has no live reconstruction, which scan.decide do needs."
     assert said.count(sentence) == 1
 
 

@@ -72,7 +72,7 @@ DECIDES = {"scan.decide": "ask", "scan.mode": "step", "scan.pass_views": 5}
 
 
 def test_without_a_live_reconstruction_it_says_that_nothing_is_decided(tmp_path: Path) -> None:
-    said = "scan.decide ask needs a live reconstruction, and this scan has none, so the scan follows its plan."
+    said = "The scan follows its plan, because it has no live reconstruction, which scan.decide ask needs."
     assert f"{SIMULATED}: {said}" in scan("--dry-run", **DECIDES).stderr
     assert "scan.decide" not in scan("--dry-run", **DECIDES | {"scan.decide": "off"}).stderr
     table = tmp_path / "day.csv"

@@ -151,7 +151,8 @@ EVENTS = [
     (
         "next_chosen",
         {**CHOSEN, "by": "program", "predicted": 0.8, "gained": 0.71, "judged": 2, "passes": 2},
-        "After pass 2: again, chosen by the program: it brings most a second. Result of an earlier choice: predicted "
+        "After pass 2: again, chosen by the program: it brings most a second. Improvement of the PSNR by an "
+        "earlier choice: predicted "
         "+0.80 dB, "
         "measured +0.71 dB",
     ),
@@ -165,7 +166,7 @@ EVENTS = [
             "gained_low": 0.2,
             "gained_high": 0.6,
         },
-        "again, chosen by the operator. Result of an earlier choice: measured +0.40 dB (0.20 to 0.60)",
+        "again, chosen by the operator. Improvement of the PSNR by an earlier choice: measured +0.40 dB (0.20 to 0.60)",
     ),
     ("next_chosen", {**CHOSEN, "by": "plan", "predicted": 0.8}, "again, as planned: it brings most a second."),
     ("recon_done", {"output": "recon.h5"}, "Volume: recon.h5"),

@@ -59,7 +59,7 @@ FAULTS = {
     "a path of Windows in double quotes": (
         ("sample: {name: test}", 'sample: {name: test}\nstorage: {folder: "D:\\tomo\\new"}'),
         "my.yaml:2: storage: folder is 'D:\\tomo\\new', with the control character '\\t'. In double quotes a "
-        "backslash starts such a character; write the text without quotes, or in single quotes",
+        "backslash starts a control character; write the text without quotes, or in single quotes",
     ),
     "a line end in a port": (
         ('port: "sim://pm16c"', 'port: "COM3\\n"'),
@@ -93,8 +93,8 @@ FAULTS = {
     ),
     "mixed": (
         ('"sim://pm16c"', "COM3"),
-        "my.yaml:7: devices.stage: simulated and real devices cannot be mixed: camera, "
-        "shutter, sample_mover simulated, stage real",
+        "my.yaml:7: devices.stage: simulated and real devices cannot be mixed, but camera, "
+        "shutter, sample_mover simulated and stage real",
     ),
     "stage of no kind": (
         ("kind: pm16c", "kind: pm16"),
@@ -120,7 +120,8 @@ FAULTS = {
     ),
     "an electrometer that sees no simulated beam": (
         ("  shutter:", "  beam_monitor: {kind: electrometer, port: COM4}\n  shutter:"),
-        "simulated and real devices cannot be mixed: stage, camera, shutter, sample_mover simulated, beam_monitor real",
+        "simulated and real devices cannot be mixed, but stage, camera, shutter, sample_mover simulated and beam_monitor "
+        "real",
     ),
     "a pattern that finds nothing": (
         ("  shutter:", "  beam_monitor: {kind: ring_current, url: 'http://ring/', pattern: mA}\n  shutter:"),

@@ -64,13 +64,17 @@ def test_names_of_keys_in_the_last_version_are_understood_with_their_places(tmp_
     [
         (
             (),
-            "scan.decide ask needs passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or in a step scan",
+            "scan.decide ask needs a scan in several passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or "
+            "in a step scan",
         ),
-        (("scan.pass_views=6",), "needs passes"),  # a fly scan
-        (("scan.angles={scheme: interlaced, views: 12, passes: 1}",), "needs passes"),
-        (("scan.mode=step", PASSES), "needs passes"),
+        (("scan.pass_views=6",), "needs a scan in several passes"),  # a fly scan
+        (("scan.angles={scheme: interlaced, views: 12, passes: 1}",), "needs a scan in several passes"),
+        (("scan.mode=step", PASSES), "needs a scan in several passes"),
         ((PASSES, "recon.live=false"), "scan.decide ask needs a live volume; set recon.live to true"),
-        ((PASSES, "recon.method=fbp"), "needs a volume that grows during the scan; set recon.method to r2"),
+        (
+            (PASSES, "recon.method=fbp"),
+            "needs a volume that grows during the scan, which only r2 makes; set recon.method to r2",
+        ),
         ((PASSES, "recon.method=auto"), "set recon.method to r2"),
     ],
 )
@@ -79,7 +83,9 @@ def test_a_scan_cannot_decide_without_what_a_prediction_needs(
 ) -> None:
     with pytest.raises(ConfigError) as caught:
         load(write(tmp_path), "scan.decide=ask", *words)
-    assert sentence in str(caught.value) and "with off the scan follows its plan" in str(caught.value)
+    assert sentence in str(caught.value) and "or set scan.decide to off, so that the scan follows its plan" in str(
+        caught.value
+    )
 
 
 def test_a_step_scan_decides_with_passes_of_some_views(tmp_path: Path) -> None:

@@ -102,7 +102,7 @@ FAULTS = {
     "bracket at the end": ("scan:\n  roi: [1, 2\n", 2, "the [ of this line is never closed"),
     "bracket in a brace": ("scan: {roi: [1, 2}\n", 1, "the [ of this line is never closed"),
     "quote": ('sample:\n  name: "x\n  title: y\n', 2, 'the " of this line is never closed'),
-    "apostrophe": ("sample:\n  name: 'it's'\n", 2, "text continues after a closing quote"),
+    "apostrophe": ("sample:\n  name: 'it's'\n", 2, "text follows after the closing quote"),
     "space": ("scan:\n  mode:step\n  views: 3\n", 3, "a space is missing after the colon of the line above"),
     "space of the first": ("mode:step\nviews: 3\n", 2, "a space is missing after the colon of the line above"),
     "colon": ("scan:\n  mode step\n  views: 3\n", 3, "a colon is missing after a key"),
@@ -118,7 +118,7 @@ FAULTS = {
     "control character": ("a: 1\nb: x\0y\n", 2, "the character U+0000 is not allowed in text"),
     "tag": ("a: 1\nb: !foo 3\n", 2, "text that begins with ! or = needs quotes"),
     "equals": ("a: 1\nb: =\n", 2, "text that begins with ! or = needs quotes"),
-    "two documents": ("a: 1\n---\nb: 2\n", 2, "a second document begins here"),
+    "two documents": ("a: 1\n---\nb: 2\n", 2, "a second YAML document begins here"),
     "list as a key": ("? [1, 2]\n: 3\n", 1, "a key of this line is a list or a group"),
     "backslash": ('a: 1\nb: "C:\\data"\n', 2, "in double quotes, a backslash starts a special character"),
 }

@@ -39,7 +39,7 @@ def test_a_slip_of_the_stage_is_counted_in_steps() -> None:
     flags = of_motion(jumping(0, 0, slip=5))
     assert [flag.frame for flag in flags] == [50]
     assert flags[0].score == pytest.approx(5, abs=0.7)
-    assert "differs from one step by" in flags[0].advice
+    assert "between two frames the sample rotated by" in flags[0].advice
 
 
 def test_vibration_raises_the_limit() -> None:

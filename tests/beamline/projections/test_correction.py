@@ -136,7 +136,8 @@ def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
     assert off[0] > 0.5 and off[1] < 0.01
     assert (
         plan.done["flats"].sentence
-        == "The ring current of the projections varies from 0.857 to 1.143 times its median; this was corrected."
+        == "The ring current of the projections varies from 0.857 to 1.143 times its median; each projection was "
+        "scaled to its ring current."
     )
     current[2] = np.nan
     source.state(currents=current)

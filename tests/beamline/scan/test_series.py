@@ -242,7 +242,7 @@ def test_a_series_is_controlled_by_the_name_of_its_folder(config: Path, tmp_path
     [
         (("scan.states.count=1",), "scan.states.count"),
         (("scan.energies=[8.3, 8.4]",), "exclude each other"),
-        (("scan.state=4",), "scan.state 4 needs scan.states with a count of at least this number"),
+        (("scan.state=4",), "scan.state 4 is larger than the number of states in scan.states"),
         (("scan.states=null", "scan.state=1"), "leave out scan.state"),
         (("scan.darks.at=end",), "needs darks before the projections"),
         (("recon.live=true", "scan.decide=do"), "set scan.states to null"),

@@ -34,9 +34,11 @@ class ElectrometerConfig(BeamMonitorSection):
     kind: Literal["electrometer"]
     port: Port = setting(doc="A serial port, socket://host:port, or sim://electrometer.")
     query: str = setting(QUERY, min_length=1)
-    pattern: Pattern = setting(PATTERN, "Regular expression whose first group is the number.")
+    pattern: Pattern = setting(PATTERN, "Regular expression for the reply; its first group must match the number.")
     unit: str = "A"
-    setup: tuple[str, ...] = setting((), "Commands without a reply, sent once at the start.")
+    setup: tuple[str, ...] = setting(
+        (), "Commands that the device does not answer; the program sends them once, when it connects."
+    )
     line_end: Literal["crlf", "cr", "lf"] = "crlf"
     baudrate: int = setting(9600, gt=0)
     transcript: str | None = setting(None, "As for the stage.")
@@ -67,7 +69,7 @@ class RingCurrentConfig(BeamMonitorSection):
 
     kind: Literal["ring_current"]
     url: Annotated[str, Setting(problem=url_problem)] = setting(doc="http://..., https://... or file:///...")
-    pattern: Pattern = setting(doc="Regular expression whose first group is the number.")
+    pattern: Pattern = setting(doc="Regular expression for the reply; its first group must match the number.")
     unit: str = "mA"
 
     def connect(self, clock: Clock, url: str | None = None) -> TextBeamMonitor:

@@ -156,7 +156,7 @@ def curve_of(views: F32, geometry: Geometry, step: Hardening) -> tuple[Curve | N
             return None, (
                 f"Beam hardening was not corrected, because the projections do not determine the curve ({error})."
             )
-        how = f"fitted to the projections; one material explains {explained:.1%} of them"
+        how = f"fitted to the projections; a sample of one material explains {explained:.1%} of their values"
     corrected = float(np.interp(highest, curve.measured, curve.corrected))
     if corrected < (1 + _LEAST_SEEN) * highest:
         return None, f"Beam hardening: none was found ({how}), so nothing was corrected."
@@ -199,11 +199,11 @@ def _clearly_seen(views: PreparedProjections) -> str:
     corrected = float(np.interp(highest := float(data[:, rows].max()), curve.measured, curve.corrected))
     if evened > _EVENED or corrected < (1 + _MATTERS) * highest:
         return ""
+    factor = 1 / evened
     return (
-        "Give --hardening fit if the sample is of one material, because the projections show beam hardening: "
-        f"the correction for one material would raise line integrals of {highest:.3g} to {corrected:.3g}, and "
-        "would reduce the variation of the total absorption of a row between projections by a factor of "
-        f"{1 / evened:.2g}. Nothing was corrected"
+        "If the sample is of one material, give --hardening fit, because the projections show beam hardening. The "
+        f"correction for one material would raise line integrals of {highest:.3g} to {corrected:.3g}. It would make "
+        f"the total absorption of each row vary {factor:.2g} times less between projections. Nothing was corrected"
     )
 
 
@@ -234,8 +234,8 @@ def fit_curve(views: F32, geometry: Geometry) -> tuple[Curve, float, float]:
 
     if geometry.is_cone:
         raise NoCurveError(
-            "a fit needs a parallel beam, because only there the total absorption is the same in all "
-            "projections. State material and beam instead"
+            "--hardening fit needs a parallel beam, because only in a parallel beam the total absorption is the "
+            "same in all projections. Give --hardening MATERIAL:BEAM instead"
         )
     view_numbers, factor, small = _small(geometry)
     measured = np.concatenate([bin_views(views[view : view + 1], factor) for view in view_numbers])

@@ -35,7 +35,7 @@ _ADDS = 0.005
 # upper limits for binned pixels and projections; all projections of parts with at most `_SHORT` projections are used
 _COLS, _ROWS, _VIEWS = 128, 16, 360
 _SHORT = 40
-_REPAIRED = "`--calibrate shifts` uses all projections and finds the position of the sample in each."
+_REPAIRED = "`--calibrate shifts` uses all projections, because it finds the position of the sample in each projection."
 
 
 @dataclass(frozen=True)
@@ -144,13 +144,13 @@ def _sentence_on_jumps(real: I64, jumps: I64, lost: int) -> str:
     if lost:
         verb = "is" if lost == 1 else "are"
         text.append(
-            f"The sample jumped at {frames_text(real)}. {count(lost, 'projection')} {verb} left out, "
-            f"because the sample had another position in them. {_REPAIRED}"
+            f"The sample jumped at {frames_text(real)}. {count(lost, 'projection')} {verb} left out, because the "
+            f"sample was at another position there. {_REPAIRED}"
         )
     if (none := np.setdiff1d(jumps, real)).size:
         text.append(
-            f"The monitor reported motion at {frames_text(none)}, but the projections show no jump of the "
-            "sample: the projections before and after it are used as they are."
+            f"The monitor reported motion at {frames_text(none)}, but the projections show no jump of the sample, so "
+            "all these projections are used without a correction."
         )
     return " ".join(text)
 

@@ -77,17 +77,21 @@ class Phase:
     distance_mm: float | None = option(
         "--distance-mm",
         None,
-        "For --phase: distance from the sample to the detector. Default: from the file.",
+        "For --phase: distance in mm from the sample to the detector. Default: the value in the scan file.",
         parse=positive,
         metavar="MM",
     )
     energy_kev: float | None = option(
-        "--energy-kev", None, "For --phase: photon energy. Default: from the file.", parse=positive, metavar="KEV"
+        "--energy-kev",
+        None,
+        "For --phase: photon energy in keV. Default: the value in the scan file.",
+        parse=positive,
+        metavar="KEV",
     )
     unsharp: tuple[float, float] | None = option(
         "--unsharp",
         None,
-        "For --phase: unsharp mask afterwards, which restores fine detail; SIGMA in pixels.",
+        "For --phase: after the phase filter, apply an unsharp mask, which restores fine detail; SIGMA is in pixels.",
         parse=_unsharp,
         metavar="SIGMA:WEIGHT",
     )

@@ -114,8 +114,13 @@ def test_a_result_without_a_row_is_kept_a_row_without_its_result_is_made_again_a
     [
         ([], 0, 0, ""),
         ([Warned("A."), StateEntered("rings", "Take --rings auto."), Warned("B.")], 0, 2, "A. B."),
-        ([Warned("Give --cone.")], 0, 1, "Give --cone. Give these options to `beamline recon "),
-        ([Warned("A."), Failed("Over --max-residual.")], 6, 1, "Over --max-residual. A. Give these options to "),
+        ([Warned("Give --cone.")], 0, 1, "Give --cone. If the options in this message apply to all scans"),
+        (
+            [Warned("A."), Failed("Over --max-residual.")],
+            6,
+            1,
+            "Over --max-residual. A. If the options in this message apply ",
+        ),
         ([Warned("A (-log)."), Failed("`beamline scan --resume R`.")], 5, 1, "`beamline scan --resume R`. A (-log)."),
     ],
 )
@@ -135,7 +140,7 @@ def test_a_row_has_what_its_reconstruction_warned_of_and_whose_the_options_are(
     passed_on: list[Event] = []
     (row,) = run_batch([Path("scan.h5")], None, Path("out"), passed_on.append, SystemClock())
     assert (row.warnings, row.message[: len(said)]) == (warnings, said)
-    assert ("`beamline recon" in row.message) == ("Give these options" in said)
+    assert ("`beamline recon" in row.message) == ("If the options in this message" in said)
     assert _table(Path("out"))["scan"]["warnings"] == str(warnings)
     for event in passed_on:
         assert "--" not in event.data.get("message", "") or "`beamline " in event.data["message"]
@@ -265,7 +270,7 @@ def test_a_table_of_names_that_are_not_of_this_program_is_refused_and_nothing_is
     Path("out/batch.csv").write_text(rows.replace("'-o", "-o"))
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     result = beamline(*given)
-    assert result.exit_code == 5 and f"{name!r} is not a name that this program would give" in result.stderr
+    assert result.exit_code == 5 and f"{name!r} is not a valid folder name for a scan" in result.stderr
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
 
 

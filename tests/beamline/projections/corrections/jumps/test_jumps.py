@@ -57,7 +57,7 @@ def test_another_sample_after_the_jump_is_left_out(tmp_path: Path) -> None:
     views[LATER] = ball_views(ANGLES[LATER], SHAPE, seed=1)
     found, told = prepared(scan(tmp_path, views, JUMP))
     assert found.geometry.n_views == JUMP and found.origin.left_out == 19 and not found.geometry.shifts.any()
-    assert "19 projections are left out, because the sample had another position" in told
+    assert "19 projections are left out, because the sample was at another position" in told
 
 
 def test_spoilt_views_between_two_false_alarms_hide_no_jump(tmp_path: Path) -> None:
