@@ -221,7 +221,7 @@ class DcamOptions(CheckedSettings):
     trigger_times: int = setting(1, "Number of pulses per frame; a fly scan needs 1.", ge=1, le=10_000)
     trigger_delay: float = setting(
         0.0,
-        "Delay from a pulse to the exposure; the angle in the file remains that of the pulse.",
+        "Delay in s from a pulse to the exposure. The angle in the file remains the angle at the pulse.",
         unit="s",
         ge=0,
         le=10,
@@ -242,5 +242,5 @@ class DcamOptions(CheckedSettings):
         ge=0,
     )
     ring: int = setting(
-        1000, "Memory limit of the ring buffer; a full frame has 18.9 MB.", unit="mb", gt=0, le=1_000_000
+        1000, "Memory limit of the ring buffer in MB; a full frame has 18.9 MB.", unit="mb", gt=0, le=1_000_000
     )

@@ -173,9 +173,9 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
         (between, "interpolated from their neighbours"),
     ):
         if dead_rows.size:
+            result = so if what == "slice" else "not used, and voxels that other rows do not show are 0"
             warn(
                 f"No data in {count(dead_rows.size, what)} of {len(masked)} (counted from 0: "
-                f"{spans(dead_rows.tolist())}), because in all projections these detector rows have no beam, zeros, no "
-                "finite values, or dead pixels. They are "
-                f"{so if what == 'slice' else 'not used, and voxels that other rows do not show are 0'}."
+                f"{spans(dead_rows.tolist())}), because in all projections these detector rows have no beam, zeros, "
+                f"no finite values, or dead pixels. These {what}s are {result}."
             )

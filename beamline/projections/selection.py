@@ -91,8 +91,8 @@ class Selection:
         low, high = _PIXEL_SIZES_UM
         if size_mm is not None and not low <= size_mm * 1e3 <= high:
             raise ConfigError(
-                f"{whose}: a pixel size of {size_mm * 1e3:.4g} um is impossible; expected {low:g} to "
-                f"{high:g} um. Give the right one with --pixel-size-um."
+                f"{whose}: a pixel size of {size_mm * 1e3:.4g} um is impossible; expected {low:g} to {high:g} um. "
+                "Give the right pixel size with --pixel-size-um."
             )
         width = source.attributes.get("sample_diameter_mm") if size_mm is not None else None
         width = width if self.sample_width is None else self.sample_width
@@ -164,12 +164,14 @@ class ScanSelection(Selection):
             meets = (self.shape[0] - 1) / 2 if self.central_row is None else self.central_row
             try:
                 if self.cone[1] < (width := full[1] * pitch) / math.sqrt(2):
-                    raise ValueError(f"the source is {self.cone[1]:g} mm from a detector that is {width:.4g} mm wide")
+                    raise ValueError(
+                        f"the source would be only {self.cone[1]:g} mm from a detector that is {width:.4g} mm wide"
+                    )
                 geometry = Geometry.cone(
                     angles, full, pitch, *self.cone, axis_col=axis_col, axis_row=meets - rows.start
                 )  # fmt: skip
             except ValueError as error:
-                raise ConfigError(f"{self.path}: {error}. Give the right ones with --cone SOD:SDD.") from error
+                raise ConfigError(f"{self.path}: {error}. Give the right distances with --cone SOD:SDD.") from error
             return geometry.binned(self.binning)
         if self.central_row is not None:
             raise ConfigError(

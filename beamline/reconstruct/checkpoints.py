@@ -125,9 +125,9 @@ class CheckpointOptions:
         if steps != saved.steps or steps == 0:
             was, now = (f"{n} steps" if n else "a time limit" for n in (saved.steps, steps))
             plans = (
-                f"that was planned for {was}, and this fit is planned for {now}"
+                f"with a plan for {was}, and the present fit has a plan for {now}"
                 if was != now
-                else "that was planned for a time limit, like this fit"
+                else "with a time limit, and the present fit also has a time limit"
             )
             warn(f"The checkpoint is from a fit {plans}: the learning rates continue at the same step of the new plan.")
         return saved.state
@@ -175,6 +175,6 @@ def refuse_other(path: Path, now: Mapping[str, Value], before: Mapping[str, Valu
     if others:
         listed = "; ".join(others[:6]) + (f"; and {len(others) - 6} more" if len(others) > 6 else "")
         raise DataError(
-            f"{path} was written for another {made_by}, so it cannot be resumed: {listed}. Use the same options as "
-            "then, or start again without --resume. No file was changed."
+            f"{path} belongs to another {made_by}, so it cannot be resumed: {listed}. Use the options with which "
+            f"{path} was written, or start again without --resume. No file was changed."
         )

@@ -208,10 +208,11 @@ def refuse_smallest(source: ScanSource, needs: ReconMemory, memory: int, binning
     if needs.least <= memory:
         return
     cheaper = replace(needs, method=Fbp(), weighted=False).least <= memory
+    largest_part = max(needs.parts, key=needs.parts.__getitem__)
     raise DataError(
-        f"{source.path}: {max(needs.parts, key=needs.parts.__getitem__)} needs {size(needs.least)} of memory, but "
-        f"{size(memory)} is allowed. Use --memory {math.ceil(needs.least / 1e6)}M if the computer has that much, or "
-        f"--bin {2 * binning}{', or -m fbp' if cheaper else ''}. Nothing was written."
+        f"{source.path}: {largest_part} needs {size(needs.least)} of memory, but {size(memory)} is allowed. Use "
+        f"--memory {math.ceil(needs.least / 1e6)}M if the computer has this much memory, or --bin "
+        f"{2 * binning}{', or -m fbp' if cheaper else ''}. Nothing was written."
     )
 
 

@@ -260,7 +260,8 @@ def _for_method(
         refuse_views(options.method_for(prepared.geometry), prepared.geometry)
     if options.cluster is not None and not plan.slabs:
         channels.warn(
-            "--cluster was not used, because the volume fits into memory. With a smaller --memory it is made in slabs."
+            "--cluster was not used, because the volume fits into memory. With a smaller --memory the volume is "
+            "made in slabs."
         )
     if options.method.stops_early and not prepared.lines.held_out.size:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")

@@ -195,13 +195,13 @@ def _in_slabs(source: ScanSource, options: ReconOptions, needs: ReconMemory, all
     slabs, missing = slabs_of_partial(partial)
     if slabs[-1].own.stop != slices:
         raise DataError(
-            f"{partial} contains a volume of {slabs[-1].own.stop} slices, but this reconstruction has {slices}. "
-            "Use the same options as then, or start again without --resume."
+            f"{partial} contains a volume of {slabs[-1].own.stop} slices, but this reconstruction has {slices}. Use "
+            f"the options with which {partial} was written, or start again without --resume."
         )
     if (wanted := needs.slab(slabs[0].own.stop)) > allowed:
         raise DataError(
             f"The slabs of {partial} need {size(wanted)} of memory, but {size(allowed)} is allowed. Use --memory "
-            f"{math.ceil(wanted / 1e6)}M if there is as much. No file was changed."
+            f"{math.ceil(wanted / 1e6)}M if the computer has this much memory. No file was changed."
         )
     return _plan(options, needs, allowed, slabs, missing)
 
@@ -343,9 +343,9 @@ def _refuse_file(source: ScanSource, options: ReconOptions) -> None:
         )
     if source.unpack_bytes > (allowed := memory_of(options)):
         raise DataError(
-            f"{source.path} is stored in chunks, and unpacking one needs {size(source.unpack_bytes)} of memory, but "
-            f"{size(allowed)} is allowed. Use --memory {math.ceil(source.unpack_bytes / 1e6)}M if there is as much, or "
-            "copy the file with one frame in each chunk. Nothing was read."
+            f"{source.path} is stored in chunks, and unpacking one chunk needs {size(source.unpack_bytes)} of "
+            f"memory, but {size(allowed)} is allowed. Use --memory {math.ceil(source.unpack_bytes / 1e6)}M if the "
+            "computer has this much memory, or copy the file with one frame in each chunk. Nothing was read."
         )
 
 
@@ -354,4 +354,4 @@ def _check_device(device: str) -> None:
     try:
         backend_for(device)
     except (ImportError, RuntimeError, ValueError) as error:
-        raise ConfigError(f"--device {device}: {error}. Leave it out to compute on the CPU.") from error
+        raise ConfigError(f"--device {device}: {error}. Leave out --device to compute on the CPU.") from error

@@ -53,8 +53,8 @@ def with_reference(
         volume_path = folder / f"{safe_name(path.stem)}_reference.h5"
         if volume_path == options.target.output:
             raise DataError(
-                f"The reference {path.name} is a scan. Its volume would be written to {volume_path}, but this is also "
-                f"the output. Name another output. Nothing was computed."
+                f"The reference {path.name} is a scan. The volume of the reference and the output would have the "
+                f"same name, {volume_path}. Name another output. Nothing was computed."
             )
         if _too_few(options):
             return options  # the method reports this, and does not use a reference
@@ -68,18 +68,20 @@ def with_reference(
                 volume_path.unlink()
                 raise ScanStopped(
                     f"The reconstruction of the reference {path.name} was stopped, so its volume {volume_path} was "
-                    "removed. The state was not reconstructed."
+                    "removed. The later scan was not reconstructed."
                 )
         path = _of_this_scan(volume_path, path)
     with opened_volume(path) as record:
         if record.kind is not VoxelKind.ATTENUATION or record.series is not None:
-            raise DataError(f"{path} is not a single volume of attenuation; give a volume that recon wrote.")
+            raise DataError(f"{path} is not a single volume of attenuation; give a volume that `beamline recon` wrote.")
         data = np.array(record.volume.data[: record.grid.shape[0]], np.float32)
         volume = Volume(data, record.grid)
     try:
         method = with_settings(options.method, {"reference": volume})
     except ValueError as error:
-        raise DataError(f"{path} cannot be used as the reference: {error}. The state was not reconstructed.") from None
+        raise DataError(
+            f"{path} cannot be used as the reference: {error}. The later scan was not reconstructed."
+        ) from None
     return replace(options, method=method)
 
 
@@ -96,7 +98,7 @@ def _of_this_scan(volume_path: Path, scan: Path) -> Path:
     with opened_volume(volume_path) as record:
         if not same_file(Path(record.raw_file), scan):
             raise DataError(
-                f"{volume_path} was made from {record.raw_file}, not from {scan.resolve()}. Move it away, or give the "
-                "volume of the reference instead of its scan. Nothing was changed."
+                f"{volume_path} was made from {record.raw_file}, not from {scan.resolve()}. Move {volume_path} away, "
+                "or give the volume of the reference instead of its scan. Nothing was changed."
             )
     return volume_path

@@ -111,7 +111,7 @@ def rows_around(scan: SelectedScan, region: Region, halo: int) -> SelectedScan:
     if obstacles:
         raise ConfigError(
             f"--roi needs slices that are aligned with rows, and {' and '.join(obstacles)} may misalign them. Use "
-            "--rows instead of --roi, or leave out the other option. Nothing was read."
+            f"--rows instead of --roi, or leave out {' and '.join(obstacles)}. Nothing was read."
         )
     rows, side, (first, end) = selection.detector_rows, selection.binning, region.z
     slices = (rows.stop - rows.start) // side

@@ -100,8 +100,8 @@ def _footnotes(
 ) -> list[str]:
     """The meaning of the figures of merit that this report shows."""
     of_several = (
-        "difference between each projection and the forward projection of the volume at its time, relative to "
-        "the projection. Less noise in the projections makes it smaller."
+        "difference between each projection and the forward projection of the volume at its time, relative to the "
+        "projection. The value also falls if the projections have less noise."
     )
     of_one = "|A x − p| / |p| over up to 16 projections p; x is the volume, A the forward projection (Joseph 1982)."
     slices = 0 if unexplained is None else len(unexplained.significance)
@@ -136,9 +136,9 @@ def _footnotes(
         (
             unexplained is not None,
             f"Unexplained structure in the residual: fraction of the sample voxels in {slices} slices at which the "
-            f"back-projected residual exceeds four standard deviations of its noise. Above {UNEXPLAINED_LIMIT:g} the "
-            "volume hides something. Compare only fits of the same projections: shifted projections have more noise, "
-            "so that fewer voxels exceed it.",
+            f"back-projected residual exceeds four standard deviations of its noise. Above {UNEXPLAINED_LIMIT:g} "
+            "cracks, pores or edges of the sample may be missing in the volume. Compare only fits of the same "
+            "projections: shifted projections have more noise, so that fewer voxels exceed four standard deviations.",
         ),
         (
             "stray" in metrics[result.method],
@@ -202,9 +202,10 @@ def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mappin
         pictures.profile_and_values(shown, unit, kind),
     )
     if len(shown) > 1:
+        reference_name = next(iter(shown))
         yield Picture(
             "Differences",
-            f"The first slice of each volume minus that of {next(iter(shown))}. Red: higher, blue: lower. "
+            f"The first slice of each volume minus the first slice of {reference_name}. Red: higher, blue: lower. "
             + ("White means no difference: the whiter, the better." if truth is not None else _NO_REFERENCE),
             pictures.differences(shown, unit, kind),
         )
@@ -342,7 +343,7 @@ def _history_caption(result: Reconstruction) -> str:
     growing = ["views"] * views_grew(result) + ["Gaussians"] * (len(gaussians) > 1)
     parts = ["Misfit to the projections in use"]
     if (judged := residual_curve(history_arrays(result.history))) is not None:
-        parts.append(f"the residual of {judged.views}, in dB below the data")
+        parts.append(f"residual of {judged.views}, in dB below the measured values")
     parts += [f"number of {' and of '.join(growing)}"] if growing else []
     since = "the file was found" if views_grew(result) else "the start"
     return f"{', '.join(parts)}, against the time since {since}. Lower misfit and more dB are better."

@@ -142,7 +142,8 @@ def refuse_impossible(options: ReconOptions) -> None:
     if not all(method.error_bars for method in options.method.alternatives):
         raise ConfigError(
             f"--uncertainty does not work with {options.method.name}, only with "
-            f"{', '.join(names_where(lambda each: each.error_bars))}. Leave it out, or choose another method."
+            f"{', '.join(names_where(lambda each: each.error_bars))}. Leave out --uncertainty, or choose another "
+            "method."
         )
     if options.target.written and options.target.output.suffix.lower() not in SUFFIXES:
         raise ConfigError(
@@ -157,7 +158,7 @@ def refuse_views(method: Method, geometry: Geometry) -> None:
     if geometry.n_views < LEAST_VIEWS:
         raise ConfigError(
             f"--uncertainty needs at least {LEAST_VIEWS} projections, because it splits them into two halves; there "
-            f"are {geometry.n_views}. Leave it out, or use more projections."
+            f"are {geometry.n_views}. Leave out --uncertainty, or use more projections."
         )
     if isinstance(method, Fit) and method.finish_sweeps == 0:
         raise ConfigError(

@@ -227,8 +227,8 @@ def keeping(path: Path) -> Iterator[None]:
         if not path.is_file():
             raise
         raise ScanStopped(
-            f"The reconstruction was stopped. {path} has the finished slabs. To make the others, add --resume {path} "
-            "to the same command."
+            f"The reconstruction was stopped. {path} has the finished slabs. To reconstruct the remaining slabs, add "
+            f"--resume {path} to the same command."
         ) from error
     remove(path)
 

@@ -181,8 +181,8 @@ class LiveSlices:
             slices = orthogonal_slices(data, geometry)
             count = f"{n} of {total}" if total > n else str(n)
             place = (
-                "the detector middle, because the axis is not known yet: expect crescents (set optics.axis_col or "
-                "--axis)"
+                "the detector middle, because the axis is not known yet; a wrong axis turns edges into crescents "
+                "(set optics.axis_col or --axis)"
                 if axis_col is None
                 else f"column {col:.1f}"
             )

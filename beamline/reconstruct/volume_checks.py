@@ -131,7 +131,7 @@ def _sample_radius(result: Reconstruction, prepared: PreparedProjections) -> str
     unit, reach = prepared.origin.length_unit, prepared.geometry.reach
     known, sure = "as given", ""
     if density == 1:
-        known = "assumed, because there are too few projections to measure it"
+        known = "an assumed value, because there are too few projections to measure the radius"
     elif low < high:
         known = f"{low:.4g} to {high:.4g} {unit} fit the projections nearly as well"
         advice = (
@@ -207,17 +207,20 @@ def odd_views_warning(odd: Sequence[OddView], outcome: MadeVolume) -> str:
         return ""
     frames, selection = outcome.prepared.ids, outcome.context.selection
     binning, first_row = selection.binning, (selection.rows or (0, 0))[0]
-    places = [
-        f"frame {frames[each.view]}, rows {first_row + each.rows[0] * binning} ... "
-        f"{first_row + each.rows[1] * binning - 1}, columns {each.cols[0] * binning} ... "
-        f"{each.cols[1] * binning - 1} (absorbs {'more' if each.score > 0 else 'less'})"
-        for each in sorted(odd, key=lambda each: -abs(each.score))[:_NAMED]
-    ]
+    places = []
+    for each in sorted(odd, key=lambda each: -abs(each.score))[:_NAMED]:
+        top, below = (first_row + row * binning for row in each.rows)
+        left, right = (col * binning for col in each.cols)
+        more_or_less = "more" if each.score > 0 else "less"
+        places.append(
+            f"frame {frames[each.view]}, rows {top} ... {below - 1}, columns {left} ... {right - 1} (the projection "
+            f"absorbs {more_or_less} than the volume)"
+        )
     more = f"; and {len(odd) - _NAMED} more" if len(odd) > _NAMED else ""
     return (
-        "Look at these frames, because something crossed the beam or the sample moved: "
-        f"{count(len(odd), 'projection')} with a part that is not in the volume (more than {LIMIT:g} times the usual "
-        f"deviation): {'; '.join(places)}{more}."
+        "Look at these frames, because something crossed the beam or the sample moved: a part of "
+        f"{count(len(odd), 'projection')} differs from the volume by more than {LIMIT:g} times the usual difference "
+        f"between projections and volume: {'; '.join(places)}{more}."
     )
 
 

@@ -183,7 +183,7 @@ class Asked:
                 raise ConfigError(
                     f"the scan in {self.part} does not answer: either its process was killed, or its disk hangs. "
                     "Nothing was changed. If the process was killed, check the instrument, and run `beamline "
-                    "recover` on its file."
+                    "recover` on the scan file."
                 )
         state = state_of(self.part)
         return state if _done(state, self.verb) or seconds > EFFECT_WITHIN else None

@@ -103,10 +103,10 @@ class DryRun:
         longest, every = max(one.duration for one in self.states), self.every
         when = "at the next `beamline resume`" if every is None else f"one every {hms_text(every)}"
         late = every is not None and longest > every
-        more = f"; a state takes {hms_text(longest)}, so the next one begins later than planned" if late else ""
+        more = f"; a state takes {hms_text(longest)}, so the next state begins later than planned" if late else ""
         return (
-            f"{len(self.states)}, each is scanned like this, {when}: {hms_text(self.needs.duration)} and "
-            f"{size(self.needs.total_bytes)} in total{more}"
+            f"{len(self.states)}, with one scan of this plan for each state, {when}: {hms_text(self.needs.duration)} "
+            f"and {size(self.needs.total_bytes)} in total{more}"
         )
 
     def data(self) -> Mapping[str, Any]:
@@ -162,14 +162,14 @@ def _doubt_optics(config: Config) -> str:
     half = 5e-4 * optics.pixel_size_um * camera.binning * camera.timing_of(settings).shape[1]
     if optics.pixel_size_um > _DEMAGNIFIED * own:
         return (
-            f"optics.pixel_size_um is {optics.pixel_size_um:g} um, but the camera's pixels are {own:g} "
-            f"um: the field of view would be {2 * half:.4g} mm wide. The setting is the size of an "
-            "unbinned pixel at the sample; is it in nm?"
+            f"optics.pixel_size_um is {optics.pixel_size_um:g} um, but the camera's pixels are {own:g} um: the field "
+            f"of view would be {2 * half:.4g} mm wide. The setting is the size of an unbinned pixel at the sample, "
+            "in um. Was the value given in nm?"
         )
     return (
-        f"optics.distance_mm is {optics.distance_mm:g} mm from sample to detector, less than half the "
-        f"field of view of {2 * half:.4g} mm: a sample that fills the field could not rotate there. Is it "
-        "in m?"
+        f"optics.distance_mm is {optics.distance_mm:g} mm from sample to detector, less than half the field of view "
+        f"of {2 * half:.4g} mm: a sample as wide as the field of view could not rotate there. Was the value given in "
+        "m?"
         if optics.distance_mm and optics.distance_mm < half
         else ""
     )
@@ -269,8 +269,9 @@ def _of_series(settings: Config, configs: Sequence[Config], each: Sequence[DryRu
     violations = dict.fromkeys(limit for one in each for limit in one.timeline.violations)
     if total.needs.total_bytes * ROOM > total.free_bytes:
         violations[
-            f"free some space, choose another storage.folder, or set fewer {what}: {len(each)} {what} "
-            f"need {size(total.needs.total_bytes)} plus a tenth, and the disk has {size(total.free_bytes)} free"
+            f"free some space, choose another storage.folder, or set fewer {what}: {len(each)} {what} need "
+            f"{size(total.needs.total_bytes)} plus a reserve of a tenth, and the disk has {size(total.free_bytes)} "
+            "free"
         ] = None
     return replace(total, timeline=replace(total.timeline, violations=tuple(violations)))
 

@@ -54,7 +54,9 @@ class Train:
 
     def __post_init__(self) -> None:
         if self.angles.ndim != 1 or self.angles.size == 0:
-            raise ValueError(f"a train needs at least one angle, got shape {self.angles.shape}")
+            raise ValueError(
+                f"a series of triggers needs a list of at least one angle, got an array of shape {self.angles.shape}"
+            )
         if not (math.isfinite(self.period) and self.period > 0):
             raise ValueError(f"the period must be positive, got {self.period} s")
 

@@ -69,10 +69,9 @@ def better_order(plan: ScanPlan) -> tuple[str, ...]:
     else:
         return ()
     return (
-        "with angles in sequence the live volume is a limited-angle reconstruction until the last "
-        f"projection. In a test scan of particles it has {_SEQUENTIAL} dB after a quarter, half and three "
-        f"quarters of the scan. With scan.angles {other} it has {expected} dB; the final volume is the "
-        "same",
+        "with angles in sequence the live volume is a limited-angle reconstruction until the last projection. In a "
+        f"test scan of particles its PSNR was {_SEQUENTIAL} dB after a quarter, half and three quarters of the scan. "
+        f"With scan.angles {other} the PSNR was {expected} dB; the final volume is the same",
     )
 
 

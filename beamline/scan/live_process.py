@@ -93,9 +93,9 @@ def commands_of(config: Config, series: ResumableRun | None = None) -> Commands:
         return Commands()
     if draws and (series is None or series.end_references is None):
         how = Commands(_followed(config, series), finished_command(config), draws=True)
-        return replace(how, remark="Pictures are drawn during the scan; the volume is made after it.")
+        return replace(how, remark="Pictures are drawn during the scan; the volume is made after the scan.")
     if not streams(method):
-        remark = f"{method} needs the complete scan, so the reconstruction starts after it."
+        remark = f"{method} needs the complete scan, so the reconstruction starts after the scan."
         return Commands(afterwards=finished_command(config), remark=remark)
     if series is not None and series.end_references is not None:
         remark = "No live volume is made, because only darks and flats are taken now: reconstruct joined.h5 afterwards."

@@ -138,8 +138,8 @@ def queue_of(scans: Iterable[PlannedScan]) -> QueuePlan:
     room = [(folder, needed, shutil.disk_usage(folder).free) for folder, needed in disks.values()]
     faults = [
         ScanFault(
-            f"all scans that can run need {size(needed)} plus a tenth on the disk of {folder}, which has {size(free)} "
-            "free. Free some space, or choose another storage.folder"
+            f"all scans that can run need {size(needed)} plus a reserve of a tenth on the disk of {folder}, which "
+            f"has {size(free)} free. Free some space, or choose another storage.folder"
         )
         for folder, needed, free in room
         if needed * ROOM > free

@@ -96,11 +96,11 @@ class ReferenceLog:
         if not n_photons < FEW_PHOTONS:
             return None
         return (
-            f"Expose for longer (scan.exposure_s={exposure * FEW_PHOTONS / n_photons:.2g}, and scan.period_s "
-            "to match), or bin the camera's pixels (devices.camera.binning): the beam is too weak. A "
-            f"pixel of the open beam has {n_photons:.3g} photons per projection (from mean and variance of "
-            f"the flats {spans([flat.row for flat in flats])}); expected {FEW_PHOTONS} or more, otherwise "
-            "noise dominates the volume. `beamline tune` measures it."
+            f"Expose for longer (scan.exposure_s={exposure * FEW_PHOTONS / n_photons:.2g}, and scan.period_s to "
+            "match), or bin the camera's pixels (devices.camera.binning): the beam is too weak. A pixel of the open "
+            f"beam has {n_photons:.3g} photons per projection (from mean and variance of the flats "
+            f"{spans([flat.row for flat in flats])}); expected {FEW_PHOTONS} or more, otherwise noise dominates the "
+            "volume. `beamline tune` measures the photons per pixel."
         )
 
 

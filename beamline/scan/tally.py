@@ -99,9 +99,10 @@ def astray_views(taken: BlockTally) -> str:
         for trigger, places in list(taken.astray.items())[:NAMED]
     ]
     more = f", and {len(taken.astray) - NAMED} more" if len(taken.astray) > NAMED else ""
+    n_exposures, n_projections = sum(map(len, taken.astray.values())), len(taken.astray)
     return (
-        f"The stage was not at its angle in {sum(map(len, taken.astray.values()))} exposures of "
-        f"{len(taken.astray)} projections ({', '.join(where)}{more}). {ASTRAY_ADVICE}."
+        f"The stage was not at its angle in {n_exposures} exposures of {n_projections} projections "
+        f"({', '.join(where)}{more}). {ASTRAY_ADVICE}."
     )
 
 
@@ -148,7 +149,8 @@ def _of_block(taken: BlockTally) -> str:
         )
     if text and taken.off > DOUBTFUL:
         text += (
-            f" A frame arrived {taken.off:.2f} periods away from its trigger, so its angle may be wrong by the "
-            "same fraction of an angular step (the warnings of the check `timing` list such frames)."
+            f" A frame arrived {taken.off:.2f} periods away from its trigger, so its angle may be wrong by the same "
+            "fraction of an angular step (the warnings of the check `timing` list the frames that came early or "
+            "late)."
         )
     return text.strip()

@@ -137,7 +137,7 @@ _PICKLE = (
     "author put into it. If you trust the author, convert FILE (in the layout of NAF and SAX-NeRF) "
     "yourself: python -c \"import numpy as np, pickle; d = pickle.load(open('FILE', 'rb')); "
     "np.save('views.npy', d['train']['projections']); np.save('angles.npy', d['train']['angles']); "
-    'print({k: v for k, v in d.items() if np.size(v) < 9})". It prints DSO, DSD and dDetector in mm. '
+    'print({k: v for k, v in d.items() if np.size(v) < 9})". This command prints DSO, DSD and dDetector in mm. '
     "Then: beamline recon views.npy --angles angles.npy --angles-unit rad --quantity line-integrals "
     "--cone DSO:DSD --pixel-size-um 1000*dDetector. Nothing was read."
 )

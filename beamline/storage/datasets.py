@@ -211,7 +211,9 @@ def broken_link(group: h5py.Group, path: str) -> str:
 def refuse_broken(group: h5py.Group, path: str) -> None:
     """Raise DataError if a path ends at a broken link."""
     if broken := broken_link(group, path):
-        raise DataError(f"{group.file.filename}: {broken}. Put the linked file back next to this one.")
+        raise DataError(
+            f"{group.file.filename}: {broken}. Put the file to which the link points back into the folder of this file."
+        )
 
 
 def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | None:

@@ -105,8 +105,8 @@ def _unopened(
         )
     if any(lock_failure(error) is LockFailure.HELD for error in problems):
         return DataError(
-            f"{path} is open for writing in another program (HDF5 could not lock it). Close it there, or "
-            "wait until that program has ended. To read the file anyway, possibly incomplete, set "
+            f"{path} is open for writing in another program (HDF5 could not lock it). Close the file in that "
+            "program, or wait until that program has ended. To read the file anyway, possibly incomplete, set "
             f"{WITHOUT} in the environment. Nothing was changed."
         )
     return DataError(f"{path} cannot be read as HDF5 ({problems[0]}).")

@@ -108,8 +108,8 @@ def next_step(scan: Path) -> str:
                 f"The file is marked as being written, but has not changed for {QUIET:.0f} s or longer. If the "
                 f"program that wrote it has ended, `h5clear -s {scan}` clears the mark."
                 if abandoned(scan)
-                else f"Another program is still writing it: `beamline recon {scan} --follow` reconstructs it "
-                "during the scan."
+                else f"Another program is still writing the scan file: `beamline recon {scan} --follow` reconstructs "
+                "the scan while it runs."
             )
     if held(scan):
         return f"The scan is still running: `beamline recon {scan} --follow` reconstructs it during the scan."
@@ -159,7 +159,7 @@ _MAKES = "makes an ordinary file of the complete frames"
 
 def _died(sure: bool) -> str:
     """A sentence on a process that was killed; on a disk without locks, it may still be running."""
-    return "The process of its scan was killed" + ("" if sure else ", unless a program is still writing to it")
+    return "The process of the scan was killed" + ("" if sure else ", unless a program is still writing to it")
 
 
 def _lacks_views(run: Path) -> bool:

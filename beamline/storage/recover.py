@@ -103,8 +103,8 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
         raise DataError(f"{no_file(path)} Nothing was changed.")
     if in_use := held(path):
         raise DataError(
-            f"{path} is open in a program that is still running: a scan that waits or pauses, or a "
-            "reader. End it first. Nothing was changed."
+            f"{path} is open in a program that is still running: a scan that waits or pauses, or a reader. End that "
+            "program first. Nothing was changed."
         )
     lock = None
     with suppress(OSError):  # a file without write permission may be complete
@@ -189,8 +189,8 @@ def _copied(path: Path, head: Superblock, target: Path) -> Recovered:
         if isinstance(error, OSError) and error.filename == str(target):
             raise
         raise DataError(
-            f"{path} is damaged, or its program was killed before the first frame ({hdf5.reason(error)}). "
-            "Nothing was changed."
+            f"{path} is damaged, or the program that wrote it was killed before the first frame "
+            f"({hdf5.reason(error)}). Nothing was changed."
         ) from error
     return Recovered(path, True, frames, dropped, missing, lost, damaged, altered)
 

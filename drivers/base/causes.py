@@ -12,7 +12,11 @@ from contextlib import suppress
 from pathlib import Path
 
 _LOADERS = (
-    (r"ELFCLASS(\d+)", "the library is for {0} bits, but this Python is not", "Use the library for this Python"),
+    (
+        r"ELFCLASS(\d+)",
+        "the library is built for {0}-bit programs, but this Python is not a {0}-bit program",
+        "Use the library for this Python",
+    ),
     (
         r"^itself: cannot open|WinError 193|incompatible arch|mach-o",
         "the library was built for another processor; this Python runs on " + sysconfig.get_platform(),
@@ -63,7 +67,7 @@ def of_port(url: str, problem: BaseException) -> str:
         ),
         (
             number in (errno.EBUSY, errno.EAGAIN) or "PermissionError(13" in str(problem),  # on Windows
-            f"Another program uses it (on Linux, `fuser {url}` names the program): close that program",
+            f"Another program uses the port (on Linux, `fuser {url}` names the program): close that program",
         ),
         (
             number == errno.ECONNREFUSED,

@@ -129,7 +129,7 @@ class DcamCamera:
         if self._ring is None or self._settings.trigger is not TriggerSource.SOFTWARE:
             armed = "not armed" if self._ring is None else "armed"
             problem = f"the camera does not accept a software trigger now ({armed}, trigger {self._settings.trigger})"
-            raise DeviceRefused(self.name, problem, advice="Configure the trigger as software and arm it")
+            raise DeviceRefused(self.name, problem, advice="Set the trigger to software, and arm the camera")
         self._dcam.cap_firetrigger(self._camera)
 
     def next_frame(self, timeout: float) -> CameraFrame:
@@ -238,7 +238,7 @@ class DcamCamera:
                     self.name,
                     f"only {ring.arrived()} of 2 test frames arrived within {START_TIMEOUT:g} s without triggers",
                     expected=f"2 frames of {_TEST_SETTINGS.exposure:g} s",
-                    advice="Check its cable, then switch it off and on",
+                    advice="Check the cable of the camera, then switch the camera off and on",
                     state="Nothing was measured",
                 )
             self._await_event(_WAIT_SLICE)
@@ -284,7 +284,7 @@ class DcamCamera:
                 request="dcamcap_status",
                 reply=state.name,
                 expected="BUSY until it is disarmed",
-                advice="Check the camera's power and cable, then arm it again",
+                advice="Check the camera's power and cable, then arm the camera again",
                 state="Frames taken before are good",
             )
         return None

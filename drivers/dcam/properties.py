@@ -76,7 +76,9 @@ class Properties:
         """Set a value and read it back. Raises DeviceRefused if the camera rounded or ignored the value."""
         accepted = self.set(prop, value)
         if abs(accepted - value) > 1e-9 * abs(value):
-            raise self._refused(f"it set {prop.name} = {accepted:g} instead of {value:g}", prop, value, f"{accepted:g}")
+            raise self._refused(
+                f"the camera set {prop.name} = {accepted:g} instead of {value:g}", prop, value, f"{accepted:g}"
+            )
 
     def set_if_available(self, prop: Property, value: float) -> None:
         """Call `set_exactly` if the camera has the property. A camera without the property behaves as if it had this
@@ -90,7 +92,7 @@ class Properties:
         if abs(accepted - value) > tolerance:
             raise DeviceRefused(
                 self._device,
-                f"it set {prop.name} = {accepted:g} instead of {value:g}",
+                f"the camera set {prop.name} = {accepted:g} instead of {value:g}",
                 request=f"{prop.name} = {value:g}",
                 reply=f"{accepted:g}",
                 expected=f"{value:g} within {tolerance:g}",

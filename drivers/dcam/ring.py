@@ -78,7 +78,7 @@ class Ring:
                 f"the frame counter of the camera decreased from {before} to {self._count}",
                 request="dcamcap_transferinfo",
                 expected="a counter that only increases during a capture",
-                advice="Check that no other program uses the camera, then arm it again",
+                advice="Check that no other program uses the camera, then arm the camera again",
                 state=f"{self._next} frames of this run were taken earlier",
             )
         return self._count

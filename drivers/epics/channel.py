@@ -14,8 +14,8 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 INVALID = 3
 """The severity of a value that the IOC does not guarantee: its hardware does not answer, or the value was never set."""
 UNREACHABLE = (
-    "Check the name, that its IOC is running, and which hosts are searched (EPICS_PVA_ADDR_LIST for pva://, "
-    "EPICS_CA_ADDR_LIST for ca://)"
+    "Check the name of the process variable, whether its IOC is running, and which hosts are searched "
+    "(EPICS_PVA_ADDR_LIST for pva://, EPICS_CA_ADDR_LIST for ca://)"
 )
 
 
@@ -124,7 +124,7 @@ class _Errors:
             "the process variable rejected the request",
             request=request,
             reply=str(reply),
-            advice="Check its access rights and that its record is enabled (DISP, DISA)",
+            advice="Check the access rights of the process variable, and whether its record is enabled (DISP, DISA)",
         ) from None
 
     def closed(self) -> NoReturn:

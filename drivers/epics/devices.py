@@ -58,11 +58,12 @@ class ShutterPvs(CheckedSettings):
 
     open_pv: str = setting(problem=url_problem)
     status_pv: str = setting(
-        doc="Process variable with the state of the blade itself; open_pv if there is none.", problem=url_problem
+        doc="Process variable with the state of the shutter blade. If the IOC has no such variable, give open_pv.",
+        problem=url_problem,
     )
     close_pv: str | None = setting(
         None,
-        "Process variable that closes the shutter; null: open_pv is used for both values.",
+        "Process variable that closes the shutter; null: open_pv opens and closes the shutter.",
         problem=url_problem,
     )
     open_value: float | str = setting(
@@ -72,7 +73,9 @@ class ShutterPvs(CheckedSettings):
     status_open: float | str = setting(
         1.0, "Value or label of the status while the shutter is open; any other value counts as closed."
     )
-    timeout: float = setting(2.0, "Longest wait for an answer of the IOC.", unit="s", gt=0, le=1e6)
+    timeout: float = setting(
+        2.0, "Longest time in s that the driver waits for an answer of the IOC.", unit="s", gt=0, le=1e6
+    )
     travel: float = setting(10.0, "Longest time until the status changes.", unit="s", gt=0, le=1e6)
 
 
@@ -139,11 +142,13 @@ class FilterPvs(CheckedSettings):
     )
     status_pv: str | None = setting(
         None,
-        "Process variable with the position of the filter itself, in the same values; null: pv.",
+        "Process variable that reads back the position of the filter, with the same values as pv; null: pv.",
         problem=url_problem,
     )
     places: Mapping[str, float | str] = setting(doc="Name: value.", min_length=1)
-    timeout: float = setting(2.0, "Longest wait for an answer of the IOC.", unit="s", gt=0, le=1e6)
+    timeout: float = setting(
+        2.0, "Longest time in s that the driver waits for an answer of the IOC.", unit="s", gt=0, le=1e6
+    )
     travel: float = setting(30.0, "Longest time until the status changes.", unit="s", gt=0, le=1e6)
 
 
@@ -214,16 +219,18 @@ class MonochromatorPvs(CheckedSettings):
     )
     unit: EnergyUnit = setting(EnergyUnit.KEV, "Unit of pv and status_pv.")
     tolerance: float = setting(
-        0.5, "Largest allowed difference between the energy and the requested energy.", unit="ev", gt=0, le=1e4
+        0.5, "Largest allowed difference in eV between the energy and the requested energy.", unit="ev", gt=0, le=1e4
     )
     settle: float = setting(
         1.0,
-        "Time for which the energy must stay within tolerance_ev before a move counts as finished.",
+        "Time in s for which the energy must stay within tolerance_ev before a move counts as finished.",
         unit="s",
         ge=0,
         le=1e6,
     )
-    timeout: float = setting(2.0, "Longest wait for an answer of the IOC.", unit="s", gt=0, le=1e6)
+    timeout: float = setting(
+        2.0, "Longest time in s that the driver waits for an answer of the IOC.", unit="s", gt=0, le=1e6
+    )
     travel: float = setting(60.0, "Longest time of a move.", unit="s", gt=0, le=1e6)
 
     @property

@@ -246,7 +246,7 @@ class SerialLine:
         else:
             raise self._error(
                 DeviceTimeout,
-                f"still no answer after an earlier failure, for {self._timeout:g} s",
+                f"the device did not answer within {self._timeout:g} s, after an earlier request had also failed",
                 request=self._probe.request,
                 expected=f"a reply of the form {self._probe.reply}",
                 advice="Check power, cable and baud rate",
@@ -302,7 +302,7 @@ class SerialLine:
                 f"it accepted no bytes for {self._timeout:g} s",
                 request=request,
                 expected="a device that accepts data",
-                advice="Check power, cable and flow control (none is expected)",
+                advice="Check power, cable and flow control (flow control must be off)",
                 state=state,
             ) from problem
         except OSError as error:

@@ -105,14 +105,14 @@ class Wiring(CheckedSettings):
     baudrate: int = setting(115_200, gt=0)
     pulse_width: float | None = setting(
         None,
-        "Width of the trigger pulses; null: the driver chooses it, or the controller has a fixed width.",
+        "Width of the trigger pulses in s; null: the driver chooses it, or the controller has a fixed width.",
         unit="s",
         gt=0,
     )
     active_high: bool = setting(
         True,
         "true: trigger pulses are high; false: low. The driver stops with an error if the controller does not "
-        "support this.",
+        "support this polarity.",
     )
     transcript: Path | None = setting(
         None, "File to which every byte to and from the controller is appended with its time; null: no file."

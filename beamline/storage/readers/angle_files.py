@@ -79,8 +79,8 @@ def _only_angles(file: h5py.File) -> str:
     ]
     if len(names) != 1:
         raise DataError(
-            f"{file.filename} has {len(names)} lists in a unit of angles. {datasets_text(file)} Name the "
-            "right one: --angles FILE::DATASET. If it states no unit, also give --angles-unit deg or rad."
+            f"{file.filename} has {len(names)} lists in a unit of angles. {datasets_text(file)} Name the list of "
+            "angles: --angles FILE::DATASET. If this dataset states no unit, also give --angles-unit deg or rad."
         )
     return names[0]
 
@@ -200,9 +200,9 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
     if frames == 1 < angles.size:
         return (
             f"{name} has {angles.size} angles, but {source.path} is one image of {source.shape[0]} x "
-            f"{source.shape[1]} pixels. If the image is a sinogram, its rows or its columns are the "
-            "projections: give that many angles, or use --angle-rows A:B to choose those that belong to "
-            "it (lines A to B - 1, counted from 0)."
+            f"{source.shape[1]} pixels. If the image is a sinogram, its rows or its columns are the projections: "
+            "give one angle for each row or each column, or use --angle-rows A:B to choose the angles of this image "
+            "(lines A to B - 1, counted from 0)."
         )
     if angles.size < n:
         message = f"{name} has {angles.size} angles for {n} projections, so {n - angles.size} projections have no angle"
@@ -231,9 +231,9 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
         )
     if angles.size < n:
         return (
-            f"{message}. Is the list cut off, or does it belong to another scan? Give one angle for each "
-            "projection, in their order. If some of the images are darks or flats, name them with "
-            "--frames, or give them with --darks and --flats."
+            f"{message}. Is the list cut off, or does it belong to another scan? Give one angle for each projection, "
+            "in the order of the projections. If some of the images are darks or flats, name them with --frames, or "
+            "give them with --darks and --flats."
         )
     sinograms, window = "", evenly_spaced_window(angles, n)
     if angles.size in source.shape:

@@ -277,10 +277,10 @@ def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.
         if start is not None and step and abs(step) <= math.pi:
             return start + step * np.arange(n_views, dtype=np.float64)
         raise DataError(
-            f"Give the angles with --angles FILE (degrees, one per line): {file.filename} has no "
-            "/exchange/theta. Neither /process/acquisition/rotation nor the attributes of /exchange state a single "
-            "start and a single step of the rotation (the step may be at most 180 degrees). Some programs assume 0 "
-            "to 180 degrees in this case; this one does not."
+            f"Give the angles with --angles FILE (degrees, one per line): {file.filename} has no /exchange/theta. "
+            "Neither /process/acquisition/rotation nor the attributes of /exchange state a single start and a "
+            "single step of the rotation (the step may be at most 180 degrees). Some programs assume 0 to 180 "
+            "degrees in this case; `beamline` does not."
         )
     angles = datasets.radians(theta, default="degrees")
     if all_there and (angles.size != n_views or n_views not in (1, *theta.shape)):

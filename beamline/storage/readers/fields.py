@@ -156,12 +156,14 @@ def _disagrees(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> b
 
 _ONE = (
     "the value differs between projections, but one value is used for all projections. Images differ in size by up "
-    "to {:.2g} px "
-    "at the edge of the field of view. Scale the images about the rotation axis to one pixel size, or state the right "
-    "one with --pixel-size-um (cone beam: --cone)"
+    "to {:.2g} px at the edge of the field of view. Scale the images about the rotation axis to one pixel size, or "
+    "state the right pixel size with --pixel-size-um (cone beam: --cone)"
 )
 _POSES = "give the shifts of the projections with --poses"
-_POINTS = "NeXus does not define its direction on the detector; state it with --poses FILE:x,-y"
+_POINTS = (
+    "NeXus does not define the direction of this translation on the detector; state the direction with "
+    "--poses FILE:x,-y"
+)
 UPRIGHT = "the detector is assumed to be perpendicular to the beam"
 _ENERGY = "energy, if the beams above state none"
 _WAVELENGTH = "energy, if no beam states one"
@@ -222,7 +224,8 @@ NXTOMO: tuple[Entry, ...] = (
     ),
     Entry(
         "sample/depends_on",
-        "if sample/rotation_angle is missing: the rotation that changes, anywhere in this chain",
+        "if sample/rotation_angle is missing: the only rotation in this chain of transformations that changes "
+        "during the scan",
     ),
     Entry("sample/name", "name in reports"),
     Entry("title", "name in reports"),
@@ -253,8 +256,8 @@ NXTOMO: tuple[Entry, ...] = (
         "the origin of this field is not defined; the axis is found in the projections, or given with --axis",
         False,
     ),
-    Entry("detector/field_of_view", "the projections show whether it is a half acquisition", False),
-    Entry("detector/half_acquisition", "the projections show whether it is a half acquisition", False),
+    Entry("detector/field_of_view", "the projections show whether the scan is a half acquisition", False),
+    Entry("detector/half_acquisition", "the projections show whether the scan is a half acquisition", False),
     Entry(
         "detector/beam_center_x",
         "the central ray of a cone is assumed to meet the rotation axis; --axis states its column",
@@ -332,8 +335,8 @@ EXCHANGE: tuple[Entry, ...] = (
     ),
     Entry(
         "measurement/instrument/detector/x_pixel_size",
-        "width of a pixel on the detector, in its `units` (default metre, as the format defines). It is multiplied by "
-        "x_binning and divided by objective/magnification",
+        "width of a pixel on the detector, in its `units` (default metre, as the format defines). This width is "
+        "multiplied by x_binning and divided by objective/magnification",
         units=EXCHANGE_LENGTH_UNITS,
     ),
     Entry(
@@ -367,7 +370,8 @@ EXCHANGE: tuple[Entry, ...] = (
         "`Both` means that flats were taken before and after the projections",
     ),
     Entry(
-        "process/acquisition/flat_fields/num_flat_fields", "number of flats each time; with `Both`, half of data_white"
+        "process/acquisition/flat_fields/num_flat_fields",
+        "number of flats in a group; if flat_field_mode is `Both`, half of data_white",
     ),
     Entry(
         "process/acquisition/flat_fields/different_flat_exposure",

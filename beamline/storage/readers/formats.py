@@ -105,8 +105,8 @@ def _unknown(path: Path) -> DataError:
         return DataError(no_image(path, [path.name]))
     if not hdf5.is_hdf5(path):
         return DataError(
-            f"{path} is neither HDF5 nor TIFF nor PNG, nor a .txrm, .npy, .npz or Zarr. A scan must be "
-            f"one of these, or a folder or .zip of images.{_WAYS.get(path.suffix.lower(), '')}"
+            f"{path} is neither HDF5 nor TIFF nor PNG, nor a .txrm, .npy, .npz or Zarr. A scan must be a file in one "
+            f"of these formats, or a folder or .zip of images.{_WAYS.get(path.suffix.lower(), '')}"
         )
     known = ", ".join(kind.name for kind in FORMATS)
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):

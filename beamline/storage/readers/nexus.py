@@ -67,7 +67,10 @@ def find(file: h5py.File) -> list[Places]:
                 if key is not None and data is not None and data.ndim == 3:
                     places.append(Places(entry, detector, data, key, *_find_angle(entry, detector, len(data))))
     if unresolved and not places:
-        raise DataError(f"{file.filename} has no frames: {unresolved[0]}. Put the linked file back next to this one.")
+        raise DataError(
+            f"{file.filename} has no frames: {unresolved[0]}. Put the file to which the link points back "
+            "into the folder of this file."
+        )
     return places
 
 
@@ -246,9 +249,9 @@ def _cone_of(
     sod, sdd = abs(upstream), abs(upstream) + beyond
     if not (sod > 0 and beyond >= 0):
         raise DataError(
-            f"{places.entry.file.filename}: the source is {upstream:g} mm from the sample and the "
-            f"detector {beyond:g} mm behind it; expected a source distance other than 0 and a detector "
-            "distance of 0 or more. Correct them in a copy of the file."
+            f"{places.entry.file.filename}: the source is {upstream:g} mm from the sample and the detector "
+            f"{beyond:g} mm behind it; expected a source distance other than 0 and a detector distance of 0 or more. "
+            "Correct the distances in a copy of the file."
         )
     width, cols = at_sample or (None if own is None else own * sod / sdd), places.data.shape[2]
     diverged = None if width is None else width * cols / 2 / sod * cols / 2

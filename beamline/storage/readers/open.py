@@ -135,7 +135,9 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         side = side_of(base) if options.side_file is None else None
         if side is None:
             raise
-        raise DataError(f"{error} {side.path.name} lies next to it: {side.option} uses it ({side}).") from error
+        raise DataError(
+            f"{error} The folder of the scan contains {side.path.name}: add {side.option} to use this file ({side})."
+        ) from error
     except BaseException:
         base.close()
         raise
@@ -282,8 +284,8 @@ def _refuse(options: SourceOptions, follow: bool) -> None:
     replaced += [f"--{name}" for name, given in (own_kinds | {"scanner-file": options.side_file}).items() if given]
     if follow and replaced:
         raise DataError(
-            f"{options.path} cannot be followed with {', '.join(replaced)}, because data that replace those of the "
-            "file must match all frames, and the scan is still adding frames."
+            f"{options.path} cannot be followed with {', '.join(replaced)}: this option replaces data of all frames, "
+            "but the scan is still adding frames. Wait until the scan has ended."
         )
     for one, other in (("angles", "angles_path"), ("darks", "darks_path"), ("flats", "flats_path")):
         if getattr(options, one) is not None and getattr(options, other) is not None:

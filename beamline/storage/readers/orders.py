@@ -117,8 +117,8 @@ def stated_order(names: str) -> Order:
     """The order that a caller states, such as "row,view,col". Raises DataError for any other text."""
     if (order := order_of_axes(names.split(","))) is None:
         raise DataError(
-            f"The dimensions are given as {names}; expected those of the array, such as frame,row,col, or "
-            "view,col for a sinogram."
+            f"The dimensions are given as {names}; expected a name for each dimension of the array, such as "
+            "frame,row,col, or view,col for a sinogram."
         )
     return order
 
@@ -172,8 +172,8 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
     if not isinstance(images, TurnedFrames) or not alike:
         raise DataError(
             f"--order {order} does not fit {base.path}, {len(base.table)} images of {base.shape[0]} x "
-            f"{base.shape[1]} pixels. It must name each dimension, and all images must show the sample: "
-            "give darks and flats with --darks and --flats."
+            f"{base.shape[1]} pixels. --order must name each dimension, and all images must show the sample: give "
+            "darks and flats with --darks and --flats."
         )
 
     def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:

@@ -73,9 +73,8 @@ class OwnScan(ScanSource):
             return None
         if sod <= 0 or beyond < 0:
             raise DataError(
-                f"{self.path}: the source is {sod:g} mm in front of the sample and the detector "
-                f"{beyond:g} mm behind it; expected a source distance above 0. Correct it in a copy of "
-                "the file."
+                f"{self.path}: the source is {sod:g} mm in front of the sample and the detector {beyond:g} mm behind "
+                "it; expected a source distance above 0. Correct the distances in a copy of the file."
             )
         return sod, sod + beyond
 

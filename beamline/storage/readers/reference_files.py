@@ -70,9 +70,9 @@ def stated_references(
         )
     if base.dtype.kind != "f":
         raise DataError(
-            f"{base.path} has {base.dtype} pixels, but transmission is a real number from 0 to 1. If an "
-            "integer such as 65535, or the counts of air next to the sample, represents a transmission "
-            "of 1, give it without --quantity: --flats 65535 --darks 0."
+            f"{base.path} has {base.dtype} pixels, but transmission is a real number from 0 to 1. If an integer such "
+            "as 65535, or the counts of air next to the sample, represents a transmission of 1, leave out "
+            "--quantity and give this integer as flat: --flats 65535 --darks 0."
         )
     return nothing, np.ones_like(nothing)
 

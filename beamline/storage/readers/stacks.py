@@ -267,8 +267,8 @@ def _only_images(file: ArrayFile) -> str:
     images = [name for name, item in file.items() if item.ndim > 1]
     if len(images) != 1:
         raise DataError(
-            f"{file.filename} contains {len(images)} arrays that may be images. {datasets_text(file)} "
-            "Name those of the scan: --data-path, --angles-path, --darks-path, --flats-path."
+            f"{file.filename} contains {len(images)} arrays that may be images. {datasets_text(file)} Name the "
+            "datasets of the scan: --data-path, --angles-path, --darks-path, --flats-path."
         )
     return images[0]
 

@@ -33,8 +33,8 @@ def brief_source(base: ScanSource, over: Callable[[], bool]) -> ScanSource:
         n = frame_indices(frames, len(base.table)).size * len(range(base.shape[0])[rows])
         if over() or base.frame_bytes > UNPACKED or n * base.shape[1] * base.dtype.itemsize > _READ:
             raise TakesTooLongError(
-                "Not all frames that may show a fault of the scan were checked, because it would take "
-                "too long. `beamline validate` checks them all."
+                "Not all frames that may show a fault of the scan were checked, because this check would take too "
+                "long. `beamline validate` checks all frames."
             )
         return read(frames, rows)
 
@@ -152,7 +152,8 @@ def selected(base: ScanSource, views: slice) -> ScanSource:
     first, end, step = views.indices(n)
     if first >= end:
         raise DataError(
-            f"--frames selects no projection: {base.path} has {n} of them, counted from 0 without darks and flats."
+            f"--frames selects no projection: {base.path} has {n} projections. --frames counts the projections from "
+            "0, without darks and flats."
         )
     for kind in (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION):
         rows = table.of_kind(kind)
@@ -357,8 +358,8 @@ def in_parts(earlier: Sequence[ScanSource], last: ScanSource, path: Path | None 
     for source in earlier:
         if (source.shape, source.dtype, source.quantity) != (last.shape, last.dtype, last.quantity):
             raise DataError(
-                f"{source.path} has {source.quantity} of {source.dtype} {source.shape}, but {last.path} "
-                f"has {last.quantity} of {last.dtype} {last.shape}: they are not parts of one scan."
+                f"{source.path} has {source.quantity} of {source.dtype} {source.shape}, but {last.path} has "
+                f"{last.quantity} of {last.dtype} {last.shape}: the two files are not parts of one scan."
             )
     in_order = all(source.in_order for source in (*earlier, last))
     if path is None:

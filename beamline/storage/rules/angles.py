@@ -133,15 +133,14 @@ def _no_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64]) -> s
     if look_like_degrees(angles):
         return (
             f"The stated angles of {angles.size} projections span {np.ptp(distinct) / 360:.1f} turns "
-            f"({np.ptp(angles):.5g} rad). These angles look like degrees that are labelled as radians. If so, "
-            "give them with --angles FILE (degrees, one per line)."
+            f"({np.ptp(angles):.5g} rad). These angles look like degrees that are labelled as radians. In that case "
+            "give the angles with --angles FILE (degrees, one per line)."
         )
     if between >= 360:
         return (
-            f"The projections go from {distinct[0]:.6g} to {distinct[-1]:.6g} degrees in steps of "
-            f"{between:.4g}, a whole turn or more. These look like counts of an encoder or of motor "
-            "steps. Give the angles in degrees with --angles FILE (one per line). If they are right, "
-            "subtract whole turns."
+            f"The projections go from {distinct[0]:.6g} to {distinct[-1]:.6g} degrees in steps of {between:.4g}, a "
+            "whole turn or more. These values look like counts of an encoder or of motor steps. Give the angles in "
+            "degrees with --angles FILE (one per line). If the values are degrees, subtract whole turns."
         )
     if (unit := _smaller_unit(distinct, angles.size)) is not None:
         return (

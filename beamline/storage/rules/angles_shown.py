@@ -284,7 +284,8 @@ def _angles_finding(scan: ScanEvidence, degrees: NDArray[np.float64], turn: _Tur
     return Finding(
         "error" if sure else "warning",
         "angle-spread",
-        f"{pairs}. {which} angles are not in degrees: {unit}. Give them in degrees with --angles FILE (one per line).",
+        f"{pairs}. {which} angles are not in degrees: {unit}. Give the angles in degrees with --angles FILE (one per "
+        "line).",
     )
 
 
@@ -339,10 +340,10 @@ def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Finding | No
     return Finding(
         "warning",
         ORDER,
-        f"{_stated(seen, (int(some[first]), int(some[like[first]])))} look more similar than neighbours "
-        f"do. {odd.sum()} of the {some.size} compared projections have such a distant twin. If the sample is not "
-        "symmetric, either the angles are not in the order of the frames, or the sample rotated further than the "
-        "angles state.",
+        f"{_stated(seen, (int(some[first]), int(some[like[first]])))} look more similar than neighbours do. "
+        f"{odd.sum()} of the {some.size} compared projections look like a projection at a distant angle. If the "
+        "sample is not symmetric, either the angles are not in the order of the frames, or the sample rotated "
+        "further than the angles state.",
     )
 
 
@@ -357,9 +358,9 @@ def _in_another_order(seen: CoarseViews, jumps: NDArray[np.int64], far: Pair, ne
     if single.size and jumps.size == 2 * single.size and single.size <= _SINGLE * seen.rows.size:
         wrong = ", ".join(f"{row} ({seen.degrees[row]:.6g})" for row in seen.rows[single[:5]].tolist())
         text += f"The angles of {single.size} projections are not between those of their neighbours: frames {wrong}. "
-        return Finding("warning", ORDER, text + "Give the right ones with --angles FILE (degrees, one per line).")
+        return Finding("warning", ORDER, text + "Give the right angles with --angles FILE (degrees, one per line).")
     text += (
-        "The angles are not in the order of the frames. Give one for each projection, in their order, with "
-        "--angles FILE."
+        "The angles are not in the order of the frames. Give one angle for each projection, in the order of the "
+        "projections, with --angles FILE."
     )
     return Finding("warning" if seen.scan.source.plan else "error", ORDER, text)

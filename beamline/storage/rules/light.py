@@ -61,8 +61,8 @@ def references_usable(scan: ScanEvidence) -> Iterator[Finding]:
                 message = f"--references accept: {message}"
             elif finding.severity == "error":
                 message += (
-                    f" Do not reconstruct the scan with them: take new {name}, or give others with "
-                    f"--{name}. `beamline recon --references accept` uses these as they are."
+                    f" Do not reconstruct the scan with these {name}: take new {name}, or give other {name} with "
+                    f"--{name}. `beamline recon --references accept` uses the faulty {name} as they are."
                 )
             else:
                 message += f" The other {name} are used instead."
@@ -116,9 +116,9 @@ def check_air_level(scan: ScanEvidence, level: float, air: bool, accepted: bool 
     if darker or level < -BRIGHTER:
         where = "The air next to the sample" if air else "The least absorbing place in the projections"
         what = (
-            "which is subtracted as a change of the beam"
+            "this difference is subtracted as a change of the beam"
             if air
-            else "which is not subtracted, because no air is known next to the sample"
+            else "this difference is not subtracted, because no air is known next to the sample"
         )
         factor = math.exp(abs(level))
         sentence = (
@@ -132,18 +132,18 @@ def check_air_level(scan: ScanEvidence, level: float, air: bool, accepted: bool 
             sentence += " If the sample is wider than the field of view and covers these columns, give --air none."
         if refused and not accepted:
             sentence += (
-                " Give flats and darks with the settings of the projections, or --references accept, which "
-                "uses these as they are."
+                " Give flats and darks with the settings of the projections, or --references accept, which uses the "
+                "flats and darks as they are."
             )
         yield Finding("error" if refused and not accepted else "warning", "light", sentence)
     elif not air and (ratio := _noise_ratio(scan)) > NOISIER:
         yield Finding(
             "warning",
             "light",
-            f"The flats have {ratio:.2g} times the noise of the projections (relative to their counts), "
-            "but in images of one camera this ratio is 1. There is no air to show which is right. Were "
-            f"the flats and darks multiplied (by about {ratio:.2g}), or are the projections means of "
-            f"several frames? {_counts_in_words(scan)}",
+            f"The flats have {ratio:.2g} times the noise of the projections (relative to their counts), but in "
+            "images of one camera this ratio is 1. No air next to the sample shows whether the flats or the "
+            f"projections are right. Were the flats and darks multiplied (by about {ratio:.2g}), or are the "
+            f"projections means of several frames? {_counts_in_words(scan)}",
         )
 
 
@@ -159,9 +159,9 @@ def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "light",
-            "All darks are 0, but the flats vary like those of a camera. This is right if the darks were "
-            "already subtracted. If not, projections and flats include the camera's offset, which makes "
-            "line integrals too small: give --darks.",
+            "All darks are 0, but the flats vary like those of a camera. Darks of 0 are right if the darks were "
+            "already subtracted from the frames. Otherwise projections and flats include the camera's offset, which "
+            "makes line integrals too small: give --darks.",
         )
     lit = lit_places(flat - dark)
     if not lit.any():
@@ -200,7 +200,10 @@ def _exposures_in_words(scan: ScanEvidence, *rows: NDArray[np.int64]) -> str:
     if all(np.isfinite(each).all() for each in exposed):
         words = [f"{np.median(each):g} s" for each in exposed]
         return f"Stated exposures: flats {words[0]}, projections {words[1]}."
-    return "The exposures are not both stated; a different exposure of the flats would cause such a difference."
+    return (
+        "The file does not state the exposures of both flats and projections; a different exposure of the flats "
+        "would cause this difference."
+    )
 
 
 def without_air(scan: ScanEvidence, mean: float) -> str:
@@ -281,7 +284,8 @@ def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "info" if known else "warning",
             "exposures",
-            f"The projections were exposed for {views.min():g} to {views.max():g} s; the intensity of each is {doubt}",
+            f"The projections were exposed for {views.min():g} to {views.max():g} s; the intensity of each "
+            f"projection is {doubt}",
         )
     darks = darks[darks > 0]
     if darks.size and np.ptp(darks) <= EXPOSURE_TOLERANCE * usual < np.abs(darks - usual).max():  # never true for NaN
@@ -317,12 +321,13 @@ def one_intensity(scan: ScanEvidence) -> Iterator[Finding]:
     beside = np.median(np.abs(np.diff(scan.table.angles[ends[0]]))) <= _BESIDE
     if not (beside and n and n == lights_in_turn(levels[1]) and change >= most):
         return
+    difference = np.expm1(change)
     yield Finding(
         "error" if lights_in_turn(_log_intensities(scan, flats[:_IN_A_ROW])) else "warning",
         "light",
-        f"The projections alternate between {n} intensities from frame to frame (from frame {views[0]} "
-        f"on; {np.expm1(change):.0%} apart): thresholds, exposures or energies. A volume can use only one "
-        f"of them. {_way_of_steps(scan, n, most)}",
+        f"The projections alternate between {n} intensities from frame to frame (from frame {views[0]} on; "
+        f"{difference:.0%} apart), because thresholds, exposures or energies alternate. A volume can use only one of "
+        f"these intensities. {_way_of_steps(scan, n, most)}",
     )
 
 
@@ -335,7 +340,10 @@ def _way_of_steps(scan: ScanEvidence, n: int, most: float) -> str:
             f"No step such as --frames 0::{n} selects projections with flats of the same intensity: also give "
             "--darks and --flats."
         )
-    return f"{' or '.join(steps)} selects one of them, with its darks and flats (projections are counted from 0)."
+    return (
+        f"{' or '.join(steps)} selects projections of one intensity, with their darks and flats (projections "
+        "are counted from 0)."
+    )
 
 
 def _log_intensities(scan: ScanEvidence, rows: I64) -> F64:
@@ -360,7 +368,6 @@ def several_energies(scan: ScanEvidence) -> str:
     """All projections were taken at one energy, as a volume requires. Otherwise the finding lists the energies."""
     energies = np.zeros(0) if scan.table.energies is None else scan.table.energies[scan.table.views]
     return "" if len(parts := frames_by_energy(energies)) < 2 else (
-        f"The projections were taken at {len(parts)} energies: {in_words(energies)}. A volume needs one "
-            f"energy. Choose it, for example with --frames energy={parts[0][0]:.6g}, which leaves out all "
-            "other frames."
+        f"The projections were taken at {len(parts)} energies: {in_words(energies)}. A volume needs one energy. "
+        f"Choose an energy, for example with --frames energy={parts[0][0]:.6g}, which leaves out all other frames."
     )  # fmt: skip

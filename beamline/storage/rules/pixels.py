@@ -51,11 +51,12 @@ def numbers_wrapped(scan: ScanEvidence) -> Iterator[Finding]:
         if edges
         else f"{low} pixels are below {below:.0f}"
     )
+    n_frames = sum(map(len, frames))
     yield Finding(
         "error",
         WRAPPED,
         "Convert the frames of the camera again, to 32-bit integers or to floats: the 16-bit integers "
-        f"overflowed. In {sum(map(len, frames))} frames checked, {what}. Two things cause this. A sum of pixels or "
+        f"overflowed. In {n_frames} frames checked, {what}. Two things cause this. A sum of pixels or "
         f"frames went above {most} and wrapped to {least}. Or a dark was subtracted and the result went below "
         f"{least}. The true values of these pixels are lost, and other "
         "flats or darks do not help.",
@@ -72,8 +73,9 @@ def quantity_stated(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "error",
             "quantity",
-            f"{remark}It is not stated whether pixels are counts, transmission or line integrals: give --quantity "
-            "counts, --quantity transmission or --quantity line-integrals." + (f" {_FALLS}" if _falls(scan) else ""),
+            f"{remark}The file does not state whether pixels are counts, transmission or line integrals: give "
+            "--quantity counts, --quantity transmission or --quantity line-integrals."
+            + (f" {_FALLS}" if _falls(scan) else ""),
         )
 
 
@@ -114,7 +116,7 @@ def pixels_measured(scan: ScanEvidence) -> Iterator[Finding]:
             "warning",
             "pixels",
             f"The line integrals have a median of {np.nanmedian(views):.4g}. No measurable beam passes through so "
-            "much material: are they counts? If so, give --quantity counts, with darks and flats.",
+            "much material. If the pixels are counts, give --quantity counts, with darks and flats.",
         )
 
 

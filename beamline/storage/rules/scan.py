@@ -55,7 +55,9 @@ def scan_ended(scan: ScanEvidence) -> Iterator[Finding]:
     elif ending.status in ("stopped", "failed"):
         planned, taken = scan.source.plan.get("angles_deg", ()), scan.table.views.size
         of_plan = f", with {taken} of {len(planned)} projections" if isinstance(planned, list) and planned else ""
-        of_plan += "; the scan itself had decided to omit the others" if ended_by(scan.source.decisions) else ""
+        of_plan += (
+            "; the scan itself had decided to omit the other projections" if ended_by(scan.source.decisions) else ""
+        )
         sentence = f"The scan ended with the status {ending.status!r} after {n}{of_plan}. {ending.reason}".strip()
     else:
         if ending.reason:
@@ -84,10 +86,9 @@ def references_present(scan: ScanEvidence) -> Iterator[Finding]:
             yield Finding(
                 "error",
                 "references",
-                f"The frames are counts, but {name} are missing. Give --{name} FILE, a folder, or their "
-                "counts as one number if none were taken. If the frames were already divided by their "
-                "flats, give --quantity transmission; if the logarithm was also taken, --quantity "
-                "line-integrals.",
+                f"The frames are counts, but {name} are missing. Give --{name} with a file or a folder. If no {name} "
+                "were taken, give the counts of a pixel as one number. If the frames were already divided by their "
+                "flats, give --quantity transmission; if the logarithm was also taken, --quantity line-integrals.",
             )
 
 
@@ -147,9 +148,9 @@ def joined_views(scan: ScanEvidence) -> str:
     degrees = float(scan.source.attributes.get(JOINED_DEG, 0.0))
     blur = np.radians(degrees) * scan.source.shape[1] / 2
     return "" if blur <= _JOINED_BLUR else (
-        f"--frames-per-view {scan.source.frames_per_view} averages frames that are up to {degrees:.3g} "
-            f"degrees apart, which blurs details at the edge of the field of view by {blur:.0f} pixels. "
-            "Unless you want that, give the number of frames taken at each angle, or omit the option."
+        f"--frames-per-view {scan.source.frames_per_view} averages frames that are up to {degrees:.3g} degrees "
+        f"apart, which blurs details at the edge of the field of view by {blur:.0f} pixels. If you do not want this "
+        "blur, give the number of frames taken at each angle, or omit the option."
     )  # fmt: skip
 
 
@@ -190,9 +191,8 @@ RULES: tuple[Rule, ...] = (
     )),
     Row("error", "angles", angles_unknown),
     Row("warning", "angles", lambda scan: (where := scan.source.attributes.get("angles_reversed")) and (
-        f"The angles of {where} are used with the opposite sign, because the vector of their axis is "
-            f"negative. --angles-path {where} uses them as stored; the volume is then the mirror image of "
-            "this one."
+        f"The angles of {where} are used with the opposite sign, because the vector of their axis is negative. "
+        f"--angles-path {where} uses them as stored; the volume is then mirrored."
     )),
     angles_spread,
     angles_shown,

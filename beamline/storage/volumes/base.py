@@ -165,7 +165,9 @@ def bare_record(path: Path, values: Any, spacing: tuple[float, float, float] | N
     if 0 in values.shape:
         raise DataError(f"{path} has no voxels: its shape is {values.shape}; expected [z, y, x].")
     if not math.isclose(dy, dx, rel_tol=1e-3):
-        raise DataError(f"{path} has voxels of {dy:g} x {dx:g} mm in a slice; only square ones can be stored.")
+        raise DataError(
+            f"{path} has voxels of {dy:g} x {dx:g} mm in a slice; only voxels that are square in a slice can be stored."
+        )
     return ReconRecord(
         volume=Volume(values, Grid(values.shape, dx, slice_pitch=dz)),
         length_unit="px" if spacing is None else "mm",

@@ -228,8 +228,8 @@ def format_of(path: Path) -> VolumeFormat:
         known = ", ".join(f"{' '.join(kind.suffixes) or 'no suffix'} ({kind.name})" for kind in formats())
         if path.name.lower().endswith((".nii", ".nii.gz")):
             raise ValueError(
-                f"{str(path)!r}: NIfTI can be read but not written. Write .nrrd instead: it stores the same, and "
-                f"programs that read NIfTI also read NRRD"
+                f"{str(path)!r}: NIfTI can be read but not written. Write .nrrd instead: NRRD stores the same values "
+                "and sizes, and programs that read NIfTI also read NRRD"
             )
         raise ValueError(
             f"{str(path)!r}: the suffix of a volume's name selects its format. {suffix!r} is unknown; "

@@ -221,8 +221,8 @@ class NXtomoWriter:
         # if h5py still had the file open, HDF5 would remove the view again when it closes the file
         if hdf5.grows_here(self.path):
             self.remarks.append(
-                f"{self.path} has no /exchange view, because this program has the file open with h5py. "
-                "Close it there; then `beamline recover` adds the view."
+                f"{self.path} has no /exchange view, because this program has the file open with h5py. Close the "
+                "h5py file in this program; then `beamline recover` adds the view."
             )
             return
         try:

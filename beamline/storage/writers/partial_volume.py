@@ -173,7 +173,8 @@ def slabs_of_partial(path: Path) -> tuple[list[Slab], list[Slab]]:
 def _refuse_unusable(path: Path) -> None:
     if not is_partial(path):
         raise DataError(
-            f"{path} is not a partial volume. `beamline recon` leaves one if it is stopped after the first slab."
+            f"{path} is not a partial volume. `beamline recon` leaves a partial volume if it is stopped after the "
+            "first slab."
         )
     if held(path):
         raise DataError(

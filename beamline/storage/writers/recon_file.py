@@ -114,7 +114,10 @@ def _beside(record: ReconRecord) -> dict[str, tuple[NDArray[np.float32], str]]:
         arrays[CHANGE] = record.change, "volume minus the moved reference"
     if record.displacement is not None:
         for axis, values in zip("zyx", record.displacement, strict=True):
-            arrays[f"{DISPLACEMENT}_{axis}"] = values, f"place in the reference minus place in the volume, along {axis}"
+            arrays[f"{DISPLACEMENT}_{axis}"] = (
+                values,
+                (f"displacement of the material along {axis}: position in the reference minus position in the volume"),
+            )
     return arrays
 
 
@@ -296,7 +299,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         DataError: the file is missing, damaged, or not a checkpoint.
     """
     if not path.is_file():
-        raise DataError(f"{path} does not exist; give a checkpoint that recon --checkpoint wrote.")
+        raise DataError(f"{path} does not exist; give a checkpoint that `beamline recon --checkpoint` wrote.")
     try:
         with opened_whole(path) as file:
             require_harmless(file)
@@ -310,4 +313,6 @@ def read_checkpoint(path: Path) -> Checkpoint:
             )
     # errors of h5py
     except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError) as error:
-        raise DataError(f"{path} is not a readable checkpoint ({error}); recon --checkpoint writes one.") from error
+        raise DataError(
+            f"{path} is not a readable checkpoint ({error}); `beamline recon --checkpoint` writes a checkpoint."
+        ) from error

@@ -52,7 +52,7 @@ def _new_file(path: Path) -> h5py.File:
             path.unlink()
         if lock_failure(error) is LockFailure.NO_LOCKS:
             why = no_locks_sentence(path.parent, error.errno)
-            raise DataError(f"{path} cannot be created: {why}. Nothing of it was left on the disk.") from error
+            raise DataError(f"{path} cannot be created: {why}. No part of the file was left on the disk.") from error
         why = hdf5.reason(error)
         raise DataError(f"{path} cannot be created ({why}). Check that its folder exists and is writable.") from error
 
@@ -86,7 +86,7 @@ class SwmrFile:
             path.unlink()
             if isinstance(error, OSError | RuntimeError):
                 raise DataError(
-                    f"{path} cannot be created ({hdf5.reason(error)}). Nothing of it was left on the disk."
+                    f"{path} cannot be created ({hdf5.reason(error)}). No part of the file was left on the disk."
                 ) from error
             raise
         self._handle: int = self.file.id.get_vfd_handle()

@@ -58,9 +58,9 @@ class EpicsSettings(StageFigures):
         Search.NONE, "How `beamline home` searches the reference: none, forward (HOMF) or reverse (HOMR)."
     )
     tolerance: int = setting(
-        10, "Largest distance from the target at which a move counts as arrived.", unit="counts", ge=0
+        10, "Largest distance from the target, in counts, at which a move counts as finished.", unit="counts", ge=0
     )
-    timeout: float = setting(2.0, "Longest wait for an answer of the IOC.", unit="s", gt=0)
+    timeout: float = setting(2.0, "Longest time in s that the driver waits for an answer of the IOC.", unit="s", gt=0)
 
     def limits(self) -> StageLimits:
         """See `StageSettings`."""
@@ -84,8 +84,8 @@ FAULTS = {  # bit of MSTA: its meaning, and advice
     ),
     0x1000: ("the IOC has no contact with its controller", "Check the controller's power and its cable to the IOC"),
     0x0040: ("it slipped or stalled", "Find what blocks the stage before you move it again"),
-    0x0004: ("it is at its upper limit switch", "Move it away from the switch by hand or in the record's own screen"),
-    0x2000: ("it is at its lower limit switch", "Move it away from the switch by hand or in the record's own screen"),
+    0x0004: ("it is at its upper limit switch", "Move the stage off the switch by hand or in the record's own screen"),
+    0x2000: ("it is at its lower limit switch", "Move the stage off the switch by hand or in the record's own screen"),
 }
 # if DMOV is 1 and the motor is not at its target, it counts as stopped when RBV has not changed for this time in s
 STILL = 1.0
@@ -166,8 +166,8 @@ class EpicsStage(LineStage):
         if self._settings.search is Search.NONE:
             raise DeviceRefused(
                 self.name,
-                "the configuration names no search for its reference (search: none)",
-                advice="Set devices.stage.search to forward or reverse, or home it in the record's own screen",
+                "the configuration defines no search for the reference of this stage (search: none)",
+                advice="Set devices.stage.search to forward or reverse, or home the stage in the record's own screen",
                 state="Nothing has moved",
             )
         with self._stops.none_while("the search for the reference"):
@@ -312,7 +312,7 @@ class EpicsStage(LineStage):
                     self.name,
                     f"{self._channel.name}{suffix} is {field_value}, so the record would not move",
                     expected=wanted,
-                    advice="Set it in the record's own screen; somebody may have stopped this motor on purpose",
+                    advice="Set this field in the record's own screen; somebody may have stopped this motor on purpose",
                     state="Nothing has moved",
                 )
 
@@ -323,7 +323,7 @@ class EpicsStage(LineStage):
             problem,
             request=self._last,
             expected="to be there without a fault",
-            advice=advice or "Find who or what stopped it before you move it again",
+            advice=advice or "Find who or what stopped the stage before you move it again",
             state=f"It {verb} at {self._travel.degrees(counts)}, {counts} counts: {fault or 'no reason given'}",
         )
 

@@ -17,12 +17,12 @@ NOT_ALLOWED_TO_MOVE = 5
 UNKNOWN_COMMAND = 2
 
 CHECK_MODEL = "Check that the controller belongs to the C-863 class and supports this command"
-CHECK_AXIS = "Check the axis in the configuration against what SAI? lists"
+CHECK_AXIS = "Check that the axis in the configuration is one of those that the command SAI? lists"
 CHECK_TRAVEL = "Compare the limits in the configuration with the controller's travel range (TMN?, TMX?)"
 CHECK_SPEED = "Compare max_speed and acceleration in the configuration with what the controller allows"
 HOME = "Search the reference first, and check that the servo is on"
 LET_GO = "Release the controller from joystick, macro or another program"
-WAIT = "Wait until it has stopped, or stop it"
+WAIT = "Wait until the stage has stopped, or stop the stage"
 OBSTACLE = "Find what blocked the stage (collision, load, cable, limit switch), then close and open the driver again"
 LINE = "Check the cable and the baud rate"
 SERVICE = "Switch the controller off and on; if the error persists, ask the vendor"
@@ -75,7 +75,7 @@ REFUSALS = {
 MOTION = frozenset({45, 49, 333, 504, 505, 1024, 1025})
 """Events after which the axis may not be at its target; they are errors of the move in which they occur."""
 EVENTS = {
-    STOPPED: ("stopped by command", "Find who stopped it before you move it again"),
+    STOPPED: ("stopped by command", "Find who stopped the stage before you move it again"),
     45: (
         "the reference move failed",
         "Check the reference switch and its cable, and remove what is in the way of the stage",

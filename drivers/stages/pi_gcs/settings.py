@@ -122,7 +122,7 @@ class PiGcsSettings(Wiring, StageFigures):
     reference: Reference = setting(Reference.SWITCH, "Switch at which the search for the reference ends.")
     first_pulse: PiFirstPulse = setting(
         PiFirstPulse.AT_THRESHOLD,
-        "Where the firmware puts the first pulse of a train. This is not documented; measure it once "
+        "Where the firmware puts the first pulse of a series. The manual does not say where; measure the place once "
         "(docs/hardware.md).",
     )
     firmware_pulse: float = setting(50e-6, "Pulse width of the firmware.", unit="s", gt=0)
@@ -131,7 +131,7 @@ class PiGcsSettings(Wiring, StageFigures):
     )
     settle: float = setting(
         1.0,
-        "Time that the driver waits after a move, because the controller may still settle on the target.",
+        "Time in s that the driver waits after a move, because the controller may still settle on the target.",
         unit="s",
         ge=0,
     )

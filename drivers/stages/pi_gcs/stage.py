@@ -157,7 +157,7 @@ class PiGcsStage(LineStage):
             f"the axis was disturbed since its last move: {meaning(code)}",
             reply=str(code),
             expected="an axis at rest",
-            advice=f"{advice(code)}. Frames since then may have been taken at another angle",
+            advice=f"{advice(code)}. Frames taken since that move may have another angle than stated",
             state="Nothing has moved because of this request; the stage is at "
             f"{self._travel.degrees(self._axis.counts())}",
         )
@@ -199,7 +199,7 @@ class PiGcsStage(LineStage):
             expected=expected,
             advice=advice(code)
             if code in EVENTS
-            else "Find what stopped it (limit switch, person) before you move it again",
+            else "Find what stopped the stage (limit switch, person) before you move it again",
             state=f"It is at {self._travel.degrees(status.counts)}, {status.counts} counts"
             + ("" if status.homed else ", which are not counted from the reference"),
         )

@@ -197,7 +197,7 @@ class PM16CChannel:
                 self._name,
                 f"{purpose} is not possible: the controller is in LOCAL",
                 reply=status.raw,
-                advice="Wait until all its motors have stopped, and set REMOTE on the panel",
+                advice="Wait until all motors of the controller have stopped, and set REMOTE on the panel",
                 state="Nothing has moved",
             )
         return status

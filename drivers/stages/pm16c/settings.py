@@ -117,8 +117,8 @@ class PM16CSettings(Wiring, StageFigures):
     channel: int = setting(0, ge=0, le=15)
     first_pulse: Pm16cFirstPulse = setting(
         Pm16cFirstPulse.AT_START,
-        "Where the firmware puts the first pulse of a train: at its start point (stated from memory, not "
-        "from the manual), or an interval after it.",
+        "Where the firmware puts the first pulse of a series: at the start point (an assumption, not from the "
+        "manual), or one interval after the start point.",
     )
     home: float | None = setting(
         None, "Angle of the home switch; null: there is no home switch, and no search is made.", unit="deg"

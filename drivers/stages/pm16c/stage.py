@@ -148,7 +148,7 @@ class PM16CStage(LineStage):
                 request=self._channel.last_move,
                 reply=status.raw,
                 expected=f"{self._travel.degrees(target)}, {target} counts",
-                advice="Find what stopped it (limit switch, interlock, stop button) before you move it again",
+                advice="Find what stopped the stage (limit switch, interlock, stop button) before you move it again",
                 state=f"It is at {self._travel.degrees(status.counts)}, {status.counts} counts",
             )
         return self.to_angle(status.counts)

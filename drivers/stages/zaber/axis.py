@@ -35,11 +35,13 @@ FAULTS = {
     "FZ": Meaning("peripheral inactive", "Plug the stage in again and activate it"),
     "FH": Meaning("emergency stop of the hardware", "Release the emergency stop, then enable the driver"),
     "FV": Meaning("supply voltage out of range, driver off", "Check the power supply"),
-    "FO": Meaning("driver disabled", "Find who disabled it, then `driver enable` with the vendor's software"),
+    "FO": Meaning(
+        "driver disabled", "Find who disabled the driver, then send `driver enable` with the vendor's software"
+    ),
     "FC": Meaning("inrush current too high", "Check the motor's cable and the power supply"),
     "FM": Meaning("motor too hot", "Let the stage cool down; use a lower speed or load"),
     "FD": Meaning(
-        "driver disabled", "Find the cause of an earlier fault, then `driver enable` with the vendor's software"
+        "driver disabled", "Find the cause of an earlier fault, then send `driver enable` with the vendor's software"
     ),
     "FQ": Meaning("encoder error, the position may be wrong", "Check the encoder's cable, then search the reference"),
     "FI": Meaning("encoder index error", "Search the reference again; check the encoder's cable"),
@@ -76,22 +78,22 @@ LOST = frozenset({"FS", "FQ", "FI", "FA", "FE"})
 """Flags of faults after which the position may be wrong."""
 UNREFERENCED = frozenset({"WR", "WH"})  # flags of an axis that has no reference
 REASONS = {
-    "AGAIN": "it repeatedly asks to repeat the request",
-    "AXISONLY": "only an axis can answer this",
+    "AGAIN": "the device repeatedly asks to repeat the request",
+    "AXISONLY": "only an axis can answer this command",
     "BADAXIS": "there is no such axis",
-    "BADCOMMAND": "it does not know this command or setting",
+    "BADCOMMAND": "the device does not know this command or setting",
     "BADDATA": "a value is missing or out of its range",
     "BADMESSAGEID": "the device cannot read the message number of the request",
-    "DEVICEONLY": "only the device as a whole can answer this",
-    "DRIVERDISABLED": "its driver is disabled",
-    "FULL": "its memory is full",
-    "INACTIVE": "its peripheral is inactive",
-    "NOACCESS": "the access level forbids it",
-    "NOTSUPPORTED": "its peripheral is not supported",
-    "PARKED": "it is parked",
-    "REMOTE": "it is under remote control by another program",
-    "STATUSBUSY": "it cannot do that while it moves",
-    "SYSTEMERROR": "it had an internal failure",
+    "DEVICEONLY": "only the device, not an axis, can answer this command",
+    "DRIVERDISABLED": "the motor driver is disabled",
+    "FULL": "the memory of the device is full",
+    "INACTIVE": "the peripheral of the device is inactive",
+    "NOACCESS": "the access level forbids this command",
+    "NOTSUPPORTED": "the peripheral of the device is not supported",
+    "PARKED": "the axis is parked",
+    "REMOTE": "the device is under remote control by another program",
+    "STATUSBUSY": "the device cannot carry out this command while it moves",
+    "SYSTEMERROR": "the device had an internal failure",
 }
 
 
@@ -305,7 +307,7 @@ class ZaberAxis:
                 f"({reply.data})",
                 request=words,
                 reply=reply.raw,
-                advice="Check the configuration against the device, and that no other program controls it",
+                advice="Check the configuration against the device, and that no other program controls the device",
                 state="The current move continues" if reply.busy else "Nothing has moved because of this request",
             )
         return reply

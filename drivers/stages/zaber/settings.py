@@ -52,8 +52,8 @@ class ZaberSettings(Wiring, StageFigures):
     )
     speed_unit: float = setting(
         SPEED_UNIT,
-        "Native units of speed for one microstep/s. The default is the vendor's convention, from memory and not from "
-        "the manual.",
+        "Native units of speed for one microstep/s. The default is the vendor's convention (an assumption, not from "
+        "the manual).",
         gt=0,
     )
     measured: bool = setting(False, "true: pulses follow the encoder, not the commanded position.")
@@ -72,7 +72,7 @@ class ZaberSettings(Wiring, StageFigures):
         2, "Number, in the controller, of the trigger that repeats the pulse after each step.", gt=0
     )
     shortest: float = setting(
-        SHORTEST, "Shortest time after which a trigger can fire again, at full speed.", unit="s", gt=0
+        SHORTEST, "Shortest time in s between two firings of a trigger, at full speed.", unit="s", gt=0
     )
 
     def __post_init__(self) -> None:

@@ -123,7 +123,7 @@ class ZaberStage(LineStage):
                 request=self._axis.last_move,
                 reply=status.raw,
                 expected=f"to be at {aim} without a fault",
-                advice="Find what stopped it before you move it again" if fault is None else fault.advice,
+                advice="Find what stopped the stage before you move it again" if fault is None else fault.advice,
                 state=f"It is at {self._travel.degrees(status.counts)}, {status.counts} counts: "
                 + ("no reason given" if fault is None else fault.text),
             )
@@ -196,7 +196,7 @@ class ZaberStage(LineStage):
             f"the stage was disturbed since its last move: {fault.text}",
             reply=status.raw,
             expected="a stage at rest",
-            advice=f"{fault.advice}. Frames since then may have been taken at another angle",
+            advice=f"{fault.advice}. Frames taken since that move may have another angle than stated",
             state=f"Nothing has moved because of this request; the stage is at {self._travel.degrees(status.counts)}",
         )
 

@@ -160,7 +160,10 @@ def test_a_label_that_its_driver_does_not_know_is_named(spinnaker: FakeIoc) -> N
 
 
 def test_a_wrong_prefix_is_a_timeout_that_says_what_to_check(loopback: dict[str, str]) -> None:
-    with pytest.raises(DeviceTimeout, match=r"no answer within 0\.5 s.*Check the name, that its IOC is running"):
+    with pytest.raises(
+        DeviceTimeout,
+        match=r"no answer within 0\.5 s.*Check the name of the process variable, whether its IOC is running",
+    ):
         AreaDetectorCamera(replace(SETTINGS, timeout=0.5), SystemClock())
 
 

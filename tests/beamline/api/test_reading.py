@@ -152,7 +152,7 @@ def test_with_an_output_the_files_of_the_command(scan: Path, tmp_path: Path) -> 
     ("arguments", "error", "said"),
     [
         ({"method": "magic"}, api.ConfigError, "magic"),
-        ({"rows": slice(0, 2, 2)}, api.ConfigError, "omit the step"),
+        ({"rows": slice(0, 2, 2)}, api.ConfigError, "give a slice without a step"),
         ({"rows": (0, 99)}, api.ConfigError, "0:99"),
         ({"views": "some"}, api.ConfigError, "some"),
     ],

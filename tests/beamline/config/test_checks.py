@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("simulated_zaber")
             r"my\.yaml:\d+: recon\.axis 8\.5 .* columns 0 \.\.\. 7",
         ),
         ("simulation: {}", "simulation: &a {scene: {x: *a}}", "contains itself"),
-        ("simulation: {}", "simulation: " + 1000 * "[", "64 nested groups"),
+        ("simulation: {}", "simulation: " + 1000 * "[", "64 groups inside each other"),
     ],
 )
 def test_what_no_type_can_say_has_its_line_too(tmp_path: Path, old: str, new: str, said: str) -> None:

@@ -120,8 +120,8 @@ FAULTS = {
     ),
     "an electrometer that sees no simulated beam": (
         ("  shutter:", "  beam_monitor: {kind: electrometer, port: COM4}\n  shutter:"),
-        "simulated and real devices cannot be mixed, but stage, camera, shutter, sample_mover simulated and beam_monitor "
-        "real",
+        "simulated and real devices cannot be mixed, but stage, camera, shutter, sample_mover simulated and "
+        "beam_monitor real",
     ),
     "a pattern that finds nothing": (
         ("  shutter:", "  beam_monitor: {kind: ring_current, url: 'http://ring/', pattern: mA}\n  shutter:"),

@@ -64,8 +64,8 @@ def test_names_of_keys_in_the_last_version_are_understood_with_their_places(tmp_
     [
         (
             (),
-            "scan.decide ask needs a scan in several passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or "
-            "in a step scan",
+            "scan.decide ask needs a scan in several passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, "
+            "or in a step scan",
         ),
         (("scan.pass_views=6",), "needs a scan in several passes"),  # a fly scan
         (("scan.angles={scheme: interlaced, views: 12, passes: 1}",), "needs a scan in several passes"),

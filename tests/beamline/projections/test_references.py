@@ -99,7 +99,12 @@ def test_flats_darker_than_the_views_are_refused_where_the_exposures_are_known()
         prepare(source(dim, dim, 0.05), SELECTION)
     found, warnings = prepare(source(dim, dim), SELECTION)
     assert found.geometry.n_views == 45
-    assert any(re.search(r"times as bright as the flats.*The exposures are not both stated", each) for each in warnings)
+    assert any(
+        re.search(
+            r"times as bright as the flats.*The file does not state the exposures of both flats and projections", each
+        )
+        for each in warnings
+    )
     fine = source(exposure=0.05)
     found, warnings = prepare(fine, SELECTION)
     assert (found.geometry.n_views, warnings) == (45, [])

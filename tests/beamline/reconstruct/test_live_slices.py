@@ -64,7 +64,7 @@ def test_they_are_drawn_from_the_eighth_view_on_for_new_views_after_a_pause() ->
     slices.draw(first(8), None, 0.0)
     assert drawn.headings == [
         "FBP of the first 8 projections, sequential: 8 of 180 degrees so far, axis at the detector middle, because the "
-        "axis is not known yet: expect crescents (set optics.axis_col or --axis)"
+        "axis is not known yet; a wrong axis turns edges into crescents (set optics.axis_col or --axis)"
     ]
     clock.time += 1
     slices.draw(first(8), 7.0, 0.0)

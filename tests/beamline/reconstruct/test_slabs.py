@@ -155,7 +155,7 @@ def test_what_does_not_fit_is_refused_before_the_work(tmp_path: Path) -> None:
     for words in ((), ("--dry-run",)):
         result = beamline("recon", "scan.h5", "-m", "fbp", "--memory", "1M", "-o", "out.h5", *words)
         assert result.exit_code == 5, result.output
-        assert "Use --memory 3M if the computer has that much, or --bin 2" in result.stderr
+        assert "Use --memory 3M if the computer has this much memory, or --bin 2" in result.stderr
     result = beamline("recon", "scan.h5", "-m", "os-sirt-tv", "--memory", "3M", "-o", "out.h5")
     assert result.exit_code == 5 and "os-sirt-tv of the smallest slab" in result.stderr and "-m fbp" in result.stderr
     result = beamline("recon", "scan.h5", "-m", "r2", "--checkpoint", "fit.h5", "--memory", "3M", "-o", "out.h5")

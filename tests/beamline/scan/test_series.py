@@ -115,7 +115,7 @@ def test_the_plan_counts_all_states_and_the_time_between_them(config: Path, tmp_
     assert [each["state"] for each in all_["states"]] == [1, 2, 3] and one["states"] == []
     assert sum(each["total_bytes"] for each in all_["states"]) == STATES * one["total_bytes"]
     told = beamline("scan", config, "--dry-run", "-o", tmp_path / "none")
-    assert "states    3, each is scanned like this, one every 0:00:40" in told.stdout, told.stdout
+    assert "states    3, with one scan of this plan for each state, one every 0:00:40" in told.stdout, told.stdout
     assert not (tmp_path / "none").exists()
     needs = dry_run(load(config)).needs
     *_, last = (each["duration"] for each in all_["states"])
@@ -123,7 +123,7 @@ def test_the_plan_counts_all_states_and_the_time_between_them(config: Path, tmp_
     own = dry_run(load(config, ["scan.states.references=each"])).needs.parts
     assert needs.parts["flat"] == pytest.approx(own["flat"] / STATES), "flats are copied"
     late = beamline("scan", config, "--dry-run", "--set", "scan.states.every_s=1").stdout
-    assert "so the next one begins later than planned" in late
+    assert "so the next state begins later than planned" in late
     rest = dry_run(load(config), whole=[1, 2])
     assert [need.state for need in rest.states] == [3] and rest.needs.duration == pytest.approx(last)
 

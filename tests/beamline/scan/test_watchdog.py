@@ -91,7 +91,9 @@ def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(
         wait_until(lambda: log.exists() and "disarmed" in log.read_text(encoding="utf-8"))
         text = log.read_text(encoding="utf-8")
         assert (
-            "did nothing for 6 s and is taken to be dead" if frozen == "scan" else "The process of the scan was killed."
+            "did nothing for 6 s, so it is assumed to hang"
+            if frozen == "scan"
+            else "The process of the scan was killed."
         ) in text
         assert "told to stop" in text
         assert ("Close the beam shutter." in text) is ("moved by hand" in text) is not outputs

@@ -62,24 +62,24 @@ def test_all_commands_say_the_same_of_a_scan_that_died(
     monkeypatch.chdir(tmp_path)
     command, *options = words
     result = beamline(command, died.parent if command == "runs" else died, *options)
-    assert f"The process of its scan was killed: {_both(died)}" in result.output
+    assert f"The process of the scan was killed: {_both(died)}" in result.output
 
 
 def test_a_scan_that_died_can_be_resumed_or_recovered_and_its_file_alone_be_recovered(
     died: Path, tmp_path: Path
 ) -> None:
     scan, alone = died / "scan.h5", tmp_path / "alone.h5"
-    assert next_step(scan) == f"The process of its scan was killed: {_both(died)}"
+    assert next_step(scan) == f"The process of the scan was killed: {_both(died)}"
     shutil.copy2(scan, alone)
     said = (
-        f"The process of its scan was killed: `beamline recover {alone}` makes an ordinary file of the complete frames."
+        f"The process of the scan was killed: `beamline recover {alone}` makes an ordinary file of the complete frames."
     )
     assert next_step(alone) == said
     for file in (scan, alone):
         os.utime(file)
-    assert next_step(scan) == f"The process of its scan was killed: {_both(died)}"
+    assert next_step(scan) == f"The process of the scan was killed: {_both(died)}"
     assert next_step(alone).startswith(
-        "The process of its scan was killed, unless a program is still writing to it: "
+        "The process of the scan was killed, unless a program is still writing to it: "
     )  # perhaps no locks
     for lock in (WriterLock(scan), WriterLock(died / "config.resolved.yaml", exclusive=True)):
         assert next_step(scan).startswith(f"The scan is still running: `beamline watch {died}`")
@@ -107,7 +107,7 @@ def test_nobody_is_told_to_continue_a_ride(tmp_path: Path) -> None:
         with (run / "config.resolved.yaml").open("a") as config:
             config.write("\nride: {image: pva://X:Pva1:Image}\n")
     died, stopped = (next_step(next((tmp_path / end).rglob("scan.h5"))) for end in ("killed", "stopped"))
-    assert died.startswith("The process of its scan was killed: `beamline recover ") and "--resume" not in died
+    assert died.startswith("The process of the scan was killed: `beamline recover ") and "--resume" not in died
     assert stopped == "The run ended early. It recorded the scan of another program, so it cannot be continued."
 
 

@@ -69,11 +69,14 @@ def test_the_group_that_owns_a_port_is_named(tmp_path: Path) -> None:
 
 
 PORTS = {
-    "another program": (serial.SerialException(errno.EBUSY, "busy"), "Another program uses it"),
-    "exclusive": (serial.SerialException(errno.EAGAIN, "Could not exclusively lock port"), "Another program uses it"),
+    "another program": (serial.SerialException(errno.EBUSY, "busy"), "Another program uses the port"),
+    "exclusive": (
+        serial.SerialException(errno.EAGAIN, "Could not exclusively lock port"),
+        "Another program uses the port",
+    ),
     "on Windows": (
         serial.SerialException("could not open port 'COM3': PermissionError(13, 'Zugriff verweigert', None, 5)"),
-        "Another program uses it",
+        "Another program uses the port",
     ),
     "not there": (serial.SerialException(errno.ENOENT, "no such file"), "Check the cable and the name of the port"),
     "a URL of another kind": (ValueError("invalid URL"), "Check the cable and the name of the port"),

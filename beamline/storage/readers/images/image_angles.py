@@ -98,7 +98,7 @@ def _doubt_of_series(
     counted = are_a_count([each["value"] for each in chosen]) and (another or len(chosen[0]["value"]) > 3)
     uneven = chosen[0].re is _NUMBER and (np.abs(distinct).max() > _TURN or not _in_even_steps(distinct))
     if words and counted:
-        return "the number next to the word only numbers the images"
+        return "the number next to the word only counts the images"
     if not words and uneven:
         return doubt or "the numbers with signs are not evenly spaced within 360 degrees"
     if distinct.size < _DISTINCT * len(chosen):
@@ -166,13 +166,13 @@ def _doubt_of_decimals(chosen: list[re.Match[str]], before: list[str]) -> str:
     """
     parts, wholes = [each["part"] or "" for each in chosen], [each["whole"] for each in chosen]
     if are_a_count(parts) or (are_a_count(wholes) and len({*parts}) > 1):
-        return "the digits before or after the decimal mark only number the images"
+        return "the digits before or after the decimal mark only count the images"
     following = [_FOLLOWING.match(each.string[each.end() :]) for each in chosen]
     for beside in (following, [_PRECEDING.search(text) for text in before]):
         halves = np.sort([int(each[1]) for each in beside if each])
         if not any(parts) and halves.size == len(chosen) and np.ptp(halves) and not _in_even_steps(halves):
             return (
-                "the number next to each angle does not number the images. Are the two numbers the integer part and "
+                "the number next to each angle does not count the images. Are the two numbers the integer part and "
                 "the decimals of one angle?"
             )
     return ""

@@ -53,9 +53,9 @@ def kinds_of(path: object, names: Sequence[str]) -> dict[str, FrameKind]:
     if sample is None:
         numbers = ", ".join(f"{len(some)} of {key!r}" for key, some in [*series.items()][:6])
         raise DataError(
-            f"{path} contains no projections, because all images are named as darks or flats ({numbers}). "
-            "If the sample has such a name, give the folder of its projections, and the others with "
-            "--darks and --flats."
+            f"{path} contains no projections, because all images are named as darks or flats ({numbers}). If the "
+            "sample itself has a name like dark or flat, give only the folder of its projections, and the other "
+            "images with --darks and --flats."
         )
     return kinds | dict.fromkeys(series[sample], FrameKind.PROJECTION)
 
@@ -276,9 +276,8 @@ def _several_series(path: object, names: Sequence[str], images: Sequence[str]) -
         if images:
             places = f", counted from 0 in this order: {places_of(in_order(path, images, one_series=True).names)}"
     return (
-        f"{path} contains several series of images: {numbers}. Name darks and flats as such "
-        "(dark_0001.tif, flat_0001.tif). Or give the folder of the projections, and the others "
-        "separately with --darks and --flats. Or state which images are which: --frames "
-        f"darks=0:5,flats=5:10, with none=10:12 for images to leave out{places}. Angles are read from "
-        "names such as a_angle-12.5_01.tif."
+        f"{path} contains several series of images: {numbers}. Name darks and flats as such (dark_0001.tif, "
+        "flat_0001.tif). Or give the folder of the projections, and the other images separately with --darks and "
+        "--flats. Or state which images are which: --frames darks=0:5,flats=5:10, with none=10:12 for images to "
+        f"leave out{places}. Angles are read from names such as a_angle-12.5_01.tif."
     )

@@ -165,8 +165,8 @@ def _refuse(path: Path, file: TxrmFile) -> None:
     # sic: the streams have this spelling
     if any(file.number(f"ImageInfo/{name}") for name in ("MosiacColumns", "MosiacRows")):
         raise DataError(
-            f"{path} is a mosaic; expected projections of one field of view each. Stitch it with the "
-            "microscope's program."
+            f"{path} is a mosaic; expected projections of one field of view each. Stitch the mosaic with the program "
+            "of the microscope."
         )
 
 

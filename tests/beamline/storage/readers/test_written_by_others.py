@@ -125,7 +125,7 @@ def test_who_does_not_follow_is_told_that_it_is_written_or_that_its_writer_has_d
 ) -> None:
     path = tmp_path / "scan.h5"
     writer.write(N if not writer.exchange else VIEWS)
-    assert "Another program is still writing it: `beamline recon" in next_step(path)
+    assert "Another program is still writing the scan file: `beamline recon" in next_step(path)
     (found,) = [each.message for each in validate(path) if each.rule == "unfinished"]
     facts = describe(path)
     assert found in facts["findings"] and not facts["finished"] and facts["attributes"]["status"] == "running"

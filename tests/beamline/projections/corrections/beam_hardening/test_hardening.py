@@ -61,7 +61,7 @@ def test_hardening_that_nobody_asked_to_correct_is_said_where_the_masses_show_it
         scan, _ = prepare(source, Selection(axis_col=49.5))
         said[energies] = scan.origin.done["hardening"].sentence
         np.testing.assert_array_equal(scan.seen.data, views)
-    assert "Give --hardening fit" in said[ENERGIES] and not said[(30.0,)]
+    assert "give --hardening fit" in said[ENERGIES] and not said[(30.0,)]
 
 
 def test_one_energy_and_two_materials_are_left_as_they_are() -> None:

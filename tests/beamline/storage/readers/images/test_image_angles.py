@@ -52,9 +52,9 @@ ASKED: dict[str, tuple[NDArray[np.float64], Name, str]] = {
     "no sign at all": (BOTH, lambda a, i: f"bone_{abs(a):.1f}deg_{i:04d}", "90 names give only 46"),
     "an underscore for the point": (FINE, lambda a, i: f"a_angle_{a:06.2f}_{i:04d}".replace(".", "_"), "decimals"),
     "the decimals beside the unit": (GOLDEN, lambda a, i: f"a_{a:07.3f}deg_{i:04d}".replace(".", "_"), "decimals"),
-    "the counter after a point": (UP, lambda a, i: f"bone_angle{a:03.0f}.{i:04d}", "number the images"),
-    "the counter after the word": (FINE, lambda a, i: f"angle_{i:04d}_{a:.2f}", "numbers the images"),
-    "the counter alone": (FINE, lambda a, i: f"tomo_angle_{i + 1:04d}", "numbers the images"),
+    "the counter after a point": (UP, lambda a, i: f"bone_angle{a:03.0f}.{i:04d}", "count the images"),
+    "the counter after the word": (FINE, lambda a, i: f"angle_{i:04d}_{a:.2f}", "counts the images"),
+    "the counter alone": (FINE, lambda a, i: f"tomo_angle_{i + 1:04d}", "counts the images"),
     "a sign in uneven steps": ((UP / 18) ** 2 - 50, lambda a, i: f"S_{i:03d}_{a:.1f}", "even"),
 }
 
