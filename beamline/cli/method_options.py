@@ -64,9 +64,10 @@ def row_settings(command: click.Command, methods: Sequence[str], values: dict[st
     settings = settings_of(command, values)
     for path in settings:
         if not set(methods) & set(owners := taking(path)):
+            methods_with_it = ", ".join(owners)
+            option = options[path]
             raise click.UsageError(
-                f"--{options[path]} works only with {', '.join(owners)}, and no row of the table uses one of these "
-                "methods."
+                f"--{option} works only with {methods_with_it}, and no row of the table uses one of these methods."
             )
     return {method: {path: value for path, value in settings.items() if method in taking(path)} for method in methods}
 
@@ -104,9 +105,10 @@ def _instead(name: str, owners: Mapping[str, Sequence[str]]) -> str:
     others = [other for other, methods in owners.items() if not set(methods) & set(owners[name])]
     if not others:
         return "add --method with one of these methods."
+    second = others[-1]
     return (
-        f"--{others[-1]} works only with {', '.join(owners[others[-1]])}. No method has both options: leave one "
-        f"of them out."
+        f"--{second} works only with {', '.join(owners[others[-1]])}. No method has both options: leave one of them "
+        "out."
     )
 
 

@@ -180,9 +180,10 @@ def table(kinds: Iterable[Kind]) -> list[str]:
         if worst.region is not None:
             top, bottom, left, right = worst.region
             where = f", rows {top}-{bottom - 1}, columns {left}-{right - 1}"
+        unit_text = units[kind.check]
         lines += [
             f"{kind.level:<6}{kind.check:<12}{count(len(kind.frames), 'frame')}: {spans(kind.frames)}",
-            f"{'':<18}worst score {worst.score:.4g} (limit {worst.limit:.4g} {units[kind.check]}), in frame "
+            f"{'':<18}worst score {worst.score:.4g} (limit {worst.limit:.4g} {unit_text}), in frame "
             f"{worst.frame}{where}",
             f"{'':<18}{worst.advice}",
         ]

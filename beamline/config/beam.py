@@ -95,7 +95,8 @@ class NamedFilter(Section):
     @model_validator(mode="after")
     def _each_once(self) -> Self:
         if twice := [name for name in dict.fromkeys(self.places) if self.places.count(name) > 1]:
-            raise ValueError(f"places lists {', '.join(twice)} more than once; each place needs its own name")
+            repeated = ", ".join(twice)
+            raise ValueError(f"places lists {repeated} more than once; each place needs its own name")
         return self
 
 

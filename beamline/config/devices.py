@@ -212,10 +212,11 @@ class DeviceSection(Section):
     def _edges_agree(self) -> Self:
         camera, high = self.camera, self.stage.settings.active_high
         if isinstance(camera, SimulatedOrca) and (camera.trigger_polarity == "positive") is not high:
+            right_polarity = "positive" if high else "negative"
             raise ValueError(
                 f"stage.active_high {str(high).lower()} contradicts camera.trigger_polarity "
-                f"{camera.trigger_polarity}: the simulated cable has no inverter, so every exposure would "
-                f"start at the end of its pulse. Set trigger_polarity {'positive' if high else 'negative'}"
+                f"{camera.trigger_polarity}: the simulated cable has no inverter, so every exposure would start at "
+                f"the end of its pulse. Set trigger_polarity {right_polarity}"
             )
         return self
 
@@ -226,9 +227,10 @@ class DeviceSection(Section):
             return self
         if taken is None:
             with_outputs = [kind for kind, driver in STAGES.items() if driver.Settings.pulse_output is not None]
+            kinds_with_outputs = " or ".join(with_outputs)
             raise ValueError(
                 f"shutter.kind: a {self.stage.kind} stage has no digital output for a shutter; set it to manual, or "
-                f"use the output of another controller (stage.kind {' or '.join(with_outputs)})"
+                f"use the output of another controller (stage.kind {kinds_with_outputs})"
             )
         if shutter.output == taken:
             raise ValueError(f"shutter.output {taken} carries the trigger pulses of the stage; choose another output")
@@ -241,9 +243,10 @@ class DeviceSection(Section):
             if not isinstance(device, MotorSection) or device.stage.simulated:
                 continue
             if (port := device.stage.port) in taken:
+                other_device = taken[port]
                 raise ValueError(
-                    f"{name}.stage.port {port} is also used by {taken[port]}, and a port can be opened "
-                    f"only once; the {name.replace('_', ' ')} needs a separate controller or record"
+                    f"{name}.stage.port {port} is also used by {other_device}, and a port can be opened only once; "
+                    f"the {name.replace('_', ' ')} needs a separate controller or record"
                 )
             taken[port] = f"devices.{name}"
         return self

@@ -404,8 +404,9 @@ class Config(Section):
             )
         texts = [f"{energy:.7g}" for energy in several or ()]  # as the names of run folders
         if twice := [text for text in texts if texts.count(text) > 1]:
+            repeated = twice[0]
             raise ValueError(
-                f"scan.energies lists {twice[0]} keV twice (compared to seven digits); give each energy once"
+                f"scan.energies lists {repeated} keV twice (compared to seven digits); give each energy once"
             )
         return self
 
@@ -444,8 +445,9 @@ class Config(Section):
             )
         low, high = getattr(device, "range_kev", None) or (0.0, math.inf)
         if beyond := [energy for energy in energies if not low <= energy <= high]:
+            bad_energy = beyond[0]
             raise ValueError(
-                f"{name}: {beyond[0]:.7g} keV is not within devices.monochromator.range_kev {low:g} ... {high:g}"
+                f"{name}: {bad_energy:.7g} keV is not within devices.monochromator.range_kev {low:g} ... {high:g}"
             )
         return self
 

@@ -174,7 +174,8 @@ def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
     problem = str(getattr(error, "problem", None) or " ".join(str(error).split()) or type(error).__name__)
     if isinstance(error, yaml.reader.ReaderError):
         at = error.position
-        return text.count("\n", 0, at) + 1, f"the character U+{ord(text[at]):04X} is not allowed in text; remove it"
+        code = ord(text[at])
+        return text.count("\n", 0, at) + 1, f"the character U+{code:04X} is not allowed in text; remove it"
     if mark is None:
         return 0, problem if isinstance(error, yaml.YAMLError) else _TAGGED
     lines = [*text.split("\n"), ""]
@@ -190,12 +191,13 @@ def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
     ]
     of_key = "mapping values" in problem or "expected ':'" in problem
     deeper = len(this) - len(this.lstrip()) > len(above) - len(above.lstrip())
+    first_character = this[mark.column :][:1]
     faults = (
         (is_quote and "end of stream" in problem, f"the {opened} of this line is never closed"),
         (is_open, f"the {opened} of this line is never closed"),
         ("'\\t'" in problem and not this[: mark.column].strip(), "this line begins with a tab; indent it with spaces"),
         (quoted, "text follows after the closing quote; to write a quote inside quoted text, write the quote twice"),
-        ("cannot start any token" in problem, f"a value begins with {this[mark.column :][:1]!r}; put it in quotes"),
+        ("cannot start any token" in problem, f"a value begins with {first_character!r}; put it in quotes"),
         ("escape" in problem, "in double quotes, a backslash starts a special character; use single quotes"),
         (opened in ("*", "&") or "alias" in problem, "text that begins with * or & needs quotes"),
         (this[mark.column :][:1] in ("!", "=") or "tag" in problem, _TAGGED),

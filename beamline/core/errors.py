@@ -138,7 +138,8 @@ def user_message(error: BaseException) -> str:
         where = "" if error.filename is None else f"{error.filename}: "
         return f"{where}{error.strerror}. Check the path, the permissions and the disk."
     if damaged(error):
-        return f"The file is damaged: HDF5 says {str(error).strip(chr(39))!r}. Use a copy of it, or the original."
+        hdf5_reason = str(error).strip(chr(39))
+        return f"The file is damaged: HDF5 says {hdf5_reason!r}. Use a copy of it, or the original."
     if isinstance(error, KeyboardInterrupt):
         return str(error) or "interrupted"
     if not isinstance(error, BeamlineError | DeviceError) and (problem := installation_problem(error)):

@@ -220,10 +220,11 @@ def refuse_existing(path: Path) -> None:
     """
     longest = os.pathconf(path.parent, "PC_NAME_MAX") if hasattr(os, "pathconf") and path.parent.is_dir() else 255
     if len(os.fsencode(path.name)) > (most := longest - _BESIDE):
+        n_bytes = len(os.fsencode(path.name))
         raise DataError(
-            f"{path}: the name is too long: {len(os.fsencode(path.name))} bytes, at most {most} are allowed, because "
-            "the program also writes files with longer names next to it (temporary files, the report). Use a shorter "
-            "name. Nothing was written."
+            f"{path}: the name is too long: {n_bytes} bytes, at most {most} are allowed, because the program also "
+            "writes files with longer names next to it (temporary files, the report). Use a shorter name. Nothing "
+            "was written."
         )
     if link := broken_link(path):
         raise DataError(

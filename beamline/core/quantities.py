@@ -118,9 +118,10 @@ def doubt(name: str, value: float | None) -> str:
         return ""
     meant = [f"{each:.4g} {known.unit} ({value:.6g} {unit})" for unit, each in known.plausible_as(value).items()]
     factor = max(abs(value) / known.high, known.low / abs(value))
+    suggestion = " Did you mean " + " or ".join(meant) + "?" if meant else ""
     return (
         f"{name} = {value:.6g} {known.unit} is outside the usual range of {known.low:g} to {known.high:g} "
-        f"{known.unit}, by a factor of {factor:.2g}.{' Did you mean ' + ' or '.join(meant) + '?' if meant else ''}"
+        f"{known.unit}, by a factor of {factor:.2g}.{suggestion}"
     )
 
 
@@ -135,10 +136,10 @@ def doubt_span(span_deg: float) -> str:
     ranges."""
     for turn in (math.pi / 2, math.pi, 2 * math.pi, 4 * math.pi):
         if abs(abs(span_deg) / turn - 1) < _SAME:
+            suggestion = math.copysign(math.degrees(turn), span_deg)
             return (
                 f"scan.angles: the range of {span_deg:g} degrees looks like a value in radians, which would be "
-                f"{math.degrees(turn):.0f} degrees. Did you mean "
-                f"{math.copysign(math.degrees(turn), span_deg):.0f}?"
+                f"{math.degrees(turn):.0f} degrees. Did you mean {suggestion:.0f}?"
             )
     return ""
 

@@ -219,10 +219,10 @@ def _refuse_unrecordable(config: Config, scene: Scene) -> None:
     camera, (height, width) = config.devices.camera, orca_quest.SENSOR_SHAPE
     row0, _, rows, _ = camera.roi or (0, 0, height, width)
     if 2 * row0 + rows != height:
+        middle_start = (height - rows) // 2
         raise ConfigError(
-            "devices.camera.roi: the scene is a cone beam, whose central ray must meet the middle of the "
-            f"sensor's rows. {rows} rows must then begin at {(height - rows) // 2}, not at {row0}. "
-            "Nothing was started."
+            "devices.camera.roi: the scene is a cone beam, whose central ray must meet the middle of the sensor's "
+            f"rows. {rows} rows must then begin at {middle_start}, not at {row0}. Nothing was started."
         )
     if config.scan.offset_views:
         raise ConfigError("scan.offset_views needs a parallel beam, but the scene is a cone beam. Nothing was started.")

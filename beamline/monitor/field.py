@@ -129,10 +129,9 @@ class FieldOfViewCheck(Logged):
 
 def beyond_the_field(cut: Mapping[str, float]) -> str:
     """A sentence that names the edges ("left", "right") beyond which the sample extends, with the line integral."""
-    return (
-        f"The sample extends beyond the {' and '.join(cut)} edge of the field of view (line integral there: "
-        f"{max(cut.values()):.2f})."
-    )
+    sides = " and ".join(cut)
+    largest = max(cut.values())
+    return f"The sample extends beyond the {sides} edge of the field of view (line integral there: {largest:.2f})."
 
 
 def _runs(marked: NDArray[np.bool_], step: float) -> list[tuple[int, int]]:
@@ -205,9 +204,10 @@ class MassCheck(Logged):
         state = replace(state, running=state.running + 1)
         if state.running < self.frames:
             return CheckResult(state)
+        entered_or_left = "entered" if score > 0 else "left"
         advice = (
             f"Look at the latest projection: the total absorption has changed by {score:+.1%} in {state.running} "
-            f"projections. Something {'entered' if score > 0 else 'left'} the field of view, or the sample changes."
+            f"projections. Something {entered_or_left} the field of view, or the sample changes."
         )
         return CheckResult(state, Flag(self.name, Level.WARN, frame.index, score, limit, advice))
 

@@ -161,10 +161,11 @@ class TimingCheck(Logged):
         score = (frame.time - state.time) / context.period - steps
         if abs(score) <= self.warn:
             return CheckResult(after)
+        late_or_early = "late" if score > 0 else "early"
+        periods = abs(score)
         advice = (
-            f"Check the stage and the trigger line: the frame came {abs(score):.0%} of a period too "
-            f"{'late' if score > 0 else 'early'}. Either the stage does not turn evenly, or the trigger line "
-            "picks up noise."
+            f"Check the stage and the trigger line: the frame came {periods:.0%} of a period too {late_or_early}. "
+            "Either the stage does not turn evenly, or the trigger line picks up noise."
         )
         return CheckResult(after, Flag(self.name, Level.WARN, frame.index, score, self.warn, advice))
 

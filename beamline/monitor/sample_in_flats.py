@@ -64,9 +64,10 @@ def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[BadFrames]
     for frames, image, others in compared:
         if others and (nearest_view := _nearest_view(image, others, projections)) is not None:
             off, like, nearest = nearest_view
+            nearest_frame = views[nearest].row
             odd.append(BadFrames(frames, off, like / LIKER, (
                 f"the sample was in the beam. In line integral, these flats differ by {off:.3g} from the "
-                f"{compared_with}, but only by {like:.2g} from the projection in frame {views[nearest].row}."
+                f"{compared_with}, but only by {like:.2g} from the projection in frame {nearest_frame}."
             )))  # fmt: skip
     if len(odd) < len(compared):  # otherwise the beam drifts, and each flat is similar to the projections next to it
         yield from odd
@@ -182,10 +183,11 @@ def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     masses, least = depth.mean(axis=(1, 2)), float(deepest.mean())
     typical_mass = float(masses.mean())
     if np.percentile(deepest, WORST) > DRIFT and LIGHTER * least - typical_mass > SIGMAS * float(masses.std()):
+        least_shown = LIGHTER * least
         yield BadFrames(flats, typical_mass, LIGHTER * least, (
             "the sample was in the beam. The differences between projections show that the sample absorbs at least "
             f"{least:.2g} (line integral, mean over the frame). But the projections divided by these flats show only "
-            f"{typical_mass:.2g} (limit {LIGHTER * least:.2g})."
+            f"{typical_mass:.2g} (limit {least_shown:.2g})."
         ))  # fmt: skip
 
 

@@ -185,9 +185,11 @@ def _valid(answer: Any, name: str, row: int) -> CheckResult[Any]:
     if not typed or any(len(box) != 4 for box in boxes if box is not None):
         raise TypeError(f"the check returned a flag in which a field has the wrong type: {flag!r:.300}")
     if flag.check != name or rows[0] > rows[1] or not 0 <= rows[1] <= row:  # `_from` removes rows that are too early
+        first_row = rows[0]
+        last_row = rows[1]
         raise ValueError(
-            f"the check returned a flag for the check {flag.check!r} and rows {rows[0]} to {rows[1]}; expected the "
-            f"check {name!r} and rows up to {row}"
+            f"the check returned a flag for the check {flag.check!r} and rows {first_row} to {last_row}; expected "
+            f"the check {name!r} and rows up to {row}"
         )
     return answer
 

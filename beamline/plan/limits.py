@@ -70,11 +70,13 @@ def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) 
     exact = step / abs(scale.per_count)
     whole = round(exact)
     if abs(whole / exact - 1) > _OTHER_SPAN:
+        degrees_per_count = math.degrees(abs(scale.per_count))
+        range_factor = whole / exact
         raise ValueError(
             f"the angular step of {math.degrees(step):.3g}° is {exact:.3g} counts of the stage "
-            f"({math.degrees(abs(scale.per_count)):.3g}° each), but the stage can trigger only on whole counts: "
-            f"the scan would cover {whole / exact:.3g} times the planned range. Take fewer projections, or a "
-            "wider range in scan.angles (in degrees), or a stage with finer counts"
+            f"({degrees_per_count:.3g}° each), but the stage can trigger only on whole counts: the scan would cover "
+            f"{range_factor:.3g} times the planned range. Take fewer projections, or a wider range in scan.angles "
+            "(in degrees), or a stage with finer counts"
         )
     direction = 1 if scale.per_count > 0 else -1
     first = to_counts(float(angles[0])) - direction * whole * int(index[0])
@@ -164,8 +166,9 @@ def violations(facts: PlanFacts) -> Iterator[str]:
     yield from _limits(facts)
     cols = facts.camera.shape[1]
     if facts.axis_col is not None and not -0.5 <= facts.axis_col <= cols - 0.5:
+        last_col = cols - 1
         yield (
-            f"optics.axis_col {facts.axis_col:g} is outside the columns of the frame, 0 ... {cols - 1}. Columns are "
+            f"optics.axis_col {facts.axis_col:g} is outside the columns of the frame, 0 ... {last_col}. Columns are "
             "counted in the region that is read out, after binning"
         )
     for name, field in (("flats", plan.flats), ("darks", plan.darks)):
@@ -175,9 +178,10 @@ def violations(facts: PlanFacts) -> Iterator[str]:
                 f"a scan without {name}"
             )
     if plan.pass_views and plan.n_views > MOST_PASSES * plan.pass_views:
+        smallest = math.ceil(plan.n_views / MOST_PASSES)
         yield (
             f"scan.pass_views {plan.pass_views} divides {plan.n_views} projections into more than {MOST_PASSES} "
-            f"passes; set it to at least {math.ceil(plan.n_views / MOST_PASSES)}, or to 0"
+            f"passes; set it to at least {smallest}, or to 0"
         )
     needed = facts.total_bytes + facts.retake_bytes
     if facts.free_bytes is not None and needed * ROOM + CLOSING > facts.free_bytes:
@@ -195,10 +199,11 @@ def remarks(facts: PlanFacts) -> Iterator[str]:
     yield from _rounding(facts)
     period = facts.views.period
     if facts.flight and abs(period - plan.period) > 1e-3 * plan.period:
+        possible_speed = facts.flight.interval / period
+        planned_speed = facts.flight.interval / plan.period
         yield (
             f"period_s becomes {period:.6g} instead of {plan.period:g}, because the stage can turn at "
-            f"{facts.flight.interval / period:.6g} counts/s, but not at {facts.flight.interval / plan.period:.6g} "
-            "counts/s"
+            f"{possible_speed:.6g} counts/s, but not at {planned_speed:.6g} counts/s"
         )
     if plan.mode is Mode.FLY and camera.min_period <= period < MARGIN * camera.min_period:
         yield (
@@ -218,8 +223,9 @@ def remarks(facts: PlanFacts) -> Iterator[str]:
         )
     criterion = math.ceil(math.pi / 2 * camera.shape[1])
     if plan.n_views < criterion:
+        n_cols = camera.shape[1]
         yield (
-            f"{plan.n_views} projections are fewer than pi/2 x {camera.shape[1]} columns = {criterion}: filtered "
+            f"{plan.n_views} projections are fewer than pi/2 x {n_cols} columns = {criterion}: filtered "
             "back-projection will show streaks towards the edge"
         )
     if plan.retakes:
@@ -246,10 +252,11 @@ def _timing(facts: PlanFacts) -> Iterator[str]:
         )
     if period < camera.min_period:
         rows, cols = camera.shape
+        advised_period = rounded(camera.min_period * MARGIN, up=True)
         yield (
             f"scan.period_s {period:.4g} is below the camera's minimum of {camera.min_period:.6g} s between triggers "
-            f"({rows} x {cols} px, {plan.exposure:g} s exposure); set scan.period_s >= "
-            f"{rounded(camera.min_period * MARGIN, up=True):g}, expose shorter or read fewer pixels"
+            f"({rows} x {cols} px, {plan.exposure:g} s exposure); set scan.period_s >= {advised_period:g}, expose "
+            "shorter or read fewer pixels"
         )
 
 
@@ -281,9 +288,9 @@ def _spacing(interval: int, stage: StageLimits) -> Iterator[str]:
     elif interval < least:
         fastest = interval / stage.pulse_spacing * 360 / stage.counts_per_turn
         yield (
-            f"projections are {interval} counts of the stage apart, but its trigger output needs at least "
-            f"{least} counts: {stage.pulse_spacing:g} s at its full speed of {degrees(stage.max_speed)}/s. Take "
-            "fewer projections, a shorter devices.stage.pulse_width_s if the stage has this setting, or "
+            f"projections are {interval} counts of the stage apart, but its trigger output needs at least {least} "
+            f"counts: {stage.pulse_spacing:g} s at its full speed of {degrees(stage.max_speed)}/s. Take fewer "
+            "projections, a shorter devices.stage.pulse_width_s if the stage has this setting, or "
             f"devices.stage.max_speed_deg_s <= {rounded(fastest):g}"
         )
 
@@ -319,11 +326,13 @@ def _rounding(facts: PlanFacts) -> Iterator[str]:
     if flight is None or flight.drift <= 1.01 * math.pi / stage.counts_per_turn:
         return
     count = 2 * math.pi / stage.counts_per_turn
+    exact_step = degrees(flight.exact * count)
+    whole_step = degrees(flight.step * count)
+    largest_change = degrees(flight.drift)
     yield (
-        f"the step of {degrees(flight.exact * count)} is {flight.exact:.6g} counts; the stage can trigger only "
-        f"on whole counts, so the step becomes {flight.step} counts = {degrees(flight.step * count)}, and the "
-        f"angles of projections change by up to {degrees(flight.drift)}. The file contains the angles at which "
-        "the stage triggered"
+        f"the step of {exact_step} is {flight.exact:.6g} counts; the stage can trigger only on whole counts, so the "
+        f"step becomes {flight.step} counts = {whole_step}, and the angles of projections change by up to "
+        f"{largest_change}. The file contains the angles at which the stage triggered"
     )
 
 

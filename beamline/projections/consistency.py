@@ -255,9 +255,10 @@ def _steady(
     outlier, odd = _out_of_line(levels, angles)
     if odd > max(_STEP_OF_LIGHT, np.nan_to_num(size)):
         size = odd
+        odd_frame = frames[outlier]
         what = (
-            f"The whole frame {frames[outlier]} is brighter or darker than the frames at neighbouring angles: the "
-            f"median of its line integrals differs from theirs by {odd:.2f} more than is usual in this scan"
+            f"The whole frame {odd_frame} is brighter or darker than the frames at neighbouring angles: the median "
+            f"of its line integrals differs from theirs by {odd:.2f} more than is usual in this scan"
         )
     sentence = (
         f"{what}, and there is no air next to the sample to correct this. Intensity, exposure, energy or "
@@ -294,10 +295,12 @@ def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: f
     because = "a sample inside the field of view has the same total absorption in all projections"
     if odd.any() and (high - low <= tolerance or odd.mean() < _FEW):
         most = shown.mass[odd][np.abs(shown.mass[odd]).argmax()]
+        how_many = count(int(odd.sum()), "projection")
+        odd_frames = frames_text(frames[odd])
+        differ = "differs" if odd.sum() == 1 else "differ"
         sentence = (
-            f"Look at these frames: {count(int(odd.sum()), 'projection')} of {odd.size} checked "
-            f"({frames_text(frames[odd])}) {'differs' if odd.sum() == 1 else 'differ'} from the others by up to "
-            f"{most:+.1%} in total absorption, but {because}. Something other than the sample was in the beam, or "
+            f"Look at these frames: {how_many} of {odd.size} checked ({odd_frames}) {differ} from the others by up "
+            f"to {most:+.1%} in total absorption, but {because}. Something other than the sample was in the beam, or "
             "the intensity is wrong. Use --views to leave these projections out."
         )
         return ConsistencyCondition("mass of the views", float(abs(most)), limit, "of the total absorption", sentence)
@@ -322,10 +325,11 @@ def _lean_of_axis(data: F32, view_numbers: NDArray[np.intp], geometry: Geometry)
     if math.isnan(sigma):
         return ConsistencyCondition("mirror images of a turn", math.nan, MATTERS, "px of tilt", "")
     rows, least = len(mean), max(MATTERS, _SURE * sigma * len(mean))
+    offset_px = abs(roll) * rows
     sentence = (
         "Use --calibrate axis,roll with an iterative method, such as -m fista-tv: the rotation axis seems to be "
-        f"tilted in the detector's plane by {tilt_text(roll, sigma)}, {abs(roll) * rows:.1f} px over {rows} "
-        "rows. Without this correction, edges are doubled in the first and last slices."
+        f"tilted in the detector's plane by {tilt_text(roll, sigma)}, {offset_px:.1f} px over {rows} rows. Without "
+        "this correction, edges are doubled in the first and last slices."
     )
     return ConsistencyCondition("mirror images of a turn", abs(roll) * rows, least, "px of tilt", sentence)
 
@@ -427,10 +431,11 @@ def _ends_of_turn(data: F32, geometry: Geometry, stretch: float) -> str:
     if alike == closed or not abs(stretch * order.size + (1 if closed else -1)) < _OF_A_STEP:
         return ""
     what = "directions one step apart" if closed else "the same rays"
+    include_or_not = "include" if closed else "do not include"
+    large_or_small = "too large" if closed else "too small"
     return (
-        f"The first and the last projection show {what}, but the stated angles "
-        f"{'include' if closed else 'do not include'} both ends of {math.degrees(turn):.4g} degrees. The angular "
-        f"step is {'too large' if closed else 'too small'}, by one part in {order.size}."
+        f"The first and the last projection show {what}, but the stated angles {include_or_not} both ends of "
+        f"{math.degrees(turn):.4g} degrees. The angular step is {large_or_small}, by one part in {order.size}."
     )
 
 
@@ -450,12 +455,14 @@ def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: fl
             worst = float(off.max())
             changes = ", ".join(np.array(words)[off > 1])
             or_scaled = _SCALED if off[2] > 1 and change[2] * change[3] > 0 else ""
+            early_frame = frames[first]
+            late_frame = frames[later]
             sentence = (
-                f"The sample changed during the scan: frames {frames[first]} and {frames[later]} measure the same "
-                f"rays at two times, and in frame {frames[later]} the sample is {changes}{or_scaled}. Other pairs of "
-                "frames of the same rays show the same change. A single volume blurs everything that changes. Use "
-                "--volumes N for several volumes in time, --calibrate shifts if the sample moved as a whole, or "
-                "--views for a part of the scan."
+                f"The sample changed during the scan: frames {early_frame} and {late_frame} measure the same rays at "
+                f"two times, and in frame {late_frame} the sample is {changes}{or_scaled}. Other pairs of frames of "
+                "the same rays show the same change. A single volume blurs everything that changes. Use --volumes N "
+                "for several volumes in time, --calibrate shifts if the sample moved as a whole, or --views for a "
+                "part of the scan."
             )
     return ConsistencyCondition(
         "views of the same rays", worst, 1.0, "times the smallest change that is reported", sentence

@@ -261,9 +261,10 @@ def apply_in_batches(
         DataError: as for `apply`; also if photons are counted, because their weights would have to be in memory.
     """
     if plan.photons is not None:
+        larger_bin = 2 * plan.scan.selection.binning
         raise DataError(
-            f"{plan.source.path}: --noise counts needs all projections in memory. Give --noise log, "
-            f"or --bin {2 * plan.scan.selection.binning}."
+            f"{plan.source.path}: --noise counts needs all projections in memory. Give --noise log, or --bin "
+            f"{larger_bin}."
         )
     in_time, frames = np.sort(frames), frames[by_angle(plan.source.table, frames)]
     parts, batches = np.split(frames, np.arange(batch, frames.size, batch)), list[Projections]()

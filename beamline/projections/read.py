@@ -97,17 +97,19 @@ def damaged_frames(scan: SelectedScan, frames: NDArray[np.int64]) -> tuple[NDArr
     lost, sentences = np.isin(frames, sorted(source.unreadable)), list[str]()
     if lost.any():
         first = int(frames[lost].min())
-        sentences.append(
-            f"{count(int(lost.sum()), 'frame')} cannot be read and {'is' if lost.sum() == 1 else 'are'} "
-            f"left out: {spans(np.sort(frames[lost]).tolist())}. {source.unreadable[first]}"
-        )
+        how_many = count(int(lost.sum()), "frame")
+        reason = source.unreadable[first]
+        are = "is" if lost.sum() == 1 else "are"
+        lost_frames = spans(np.sort(frames[lost]).tolist())
+        sentences.append(f"{how_many} cannot be read and {are} left out: {lost_frames}. {reason}")
     damaged = np.isin(frames, sorted(source.damaged)) & ~lost
     used = scan.selection.step(Preparation).uses_flags
     if damaged.any():
         taken = "left out" if used else "used anyway (--flags ignore)"
+        which = frames_text(np.sort(frames[damaged]))
+        differ = "differs" if damaged.sum() == 1 else "differ"
         sentences.append(
-            f"Look for an intact copy of {source.path}: {frames_text(np.sort(frames[damaged]))} "
-            f"{'differs' if damaged.sum() == 1 else 'differ'} from the stored checksum, {taken}."
+            f"Look for an intact copy of {source.path}: {which} {differ} from the stored checksum, {taken}."
         )
     return lost | damaged if used else lost, sentences
 
@@ -142,9 +144,10 @@ class ViewFilters:
         outcomes = {step.name: step.on(scan) for step in in_order(selection) if isinstance(step, ViewStep)}
         filters = tuple(each for each, _ in outcomes.values() if each is not None)
         if filters and selection.step(Preparation).noise == "counts":
+            filter_mixes = filters[-1].mixes
             raise ConfigError(
-                f"Omit --noise counts or the filter: {filters[-1].mixes} neighbouring pixels, and the "
-                "counts of mixed pixels have no known likelihood."
+                f"Omit --noise counts or the filter: {filter_mixes} neighbouring pixels, and the counts of mixed "
+                "pixels have no known likelihood."
             )
         done = {name: each for name, (_, each) in outcomes.items()}
         return cls(filters, done, scan)
@@ -207,9 +210,12 @@ def read_views(
     if not alive.all():
         dark = frames[~alive]
         if rows is None:  # a band of rows is not enough to decide whether a projection is usable
+            first_frame = dark[0]
+            have = "has" if dark.size == 1 else "have"
+            are = "is" if dark.size == 1 else "are"
             reported.append(
-                f"{dark.size} of {source.table.views.size} projections {'has' if dark.size == 1 else 'have'} no "
-                f"finite pixel and {'is' if dark.size == 1 else 'are'} left out (first: frame {dark[0]})."
+                f"{dark.size} of {source.table.views.size} projections {have} no finite pixel and {are} left out "
+                f"(first: frame {first_frame})."
             )
         data, frames = data[alive], frames[alive]
     exposed, part = np.ones(len(frames), np.bool_), filters.within(rows)
@@ -236,10 +242,11 @@ def _copies(scan: ScanEvidence, data: NDArray[Any], frames: NDArray[np.int64]) -
     copies = [int(frames[view + 1]) for view in alike if np.array_equal(data[view], data[view + 1])]
     if not copies or 2 * len(copies) >= len(frames):  # if most projections are equal, the images were computed
         return []
+    are = "is" if len(copies) == 1 else "are"
     return [
         "Omit these frames with --views or --flags judge, or repeat them: "
         f"{count(len(copies), 'projection')} of {scan.source.table.views.size} "
-        f"({frames_text(copies)}) {'is' if len(copies) == 1 else 'are'} identical to the "
+        f"({frames_text(copies)}) {are} identical to the "
         "projection before. The camera or its driver delivered an image twice, so the angle of "
         "the copy is wrong."
     ]
@@ -253,10 +260,11 @@ def unlit_sentence(scan: ScanEvidence, requested: NDArray[np.int64], exposed: ND
     if not unlit.size:
         return ""
     gap = f", and{gap_text}" if (gap_text := gap_sentence(scan.source, requested, exposed)) else ""
+    they_are = "It is" if unlit.size == 1 else "They are"
     return (
-        f"{count(unlit.size, 'projection')} of {scan.source.table.views.size} ({frames_text(unlit)}) had "
-        "no beam: the shutter was closed, the beam was lost, or these frames were never written to the "
-        f"file. {'It is' if unlit.size == 1 else 'They are'} left out{gap}."
+        f"{count(unlit.size, 'projection')} of {scan.source.table.views.size} ({frames_text(unlit)}) had no beam: "
+        f"the shutter was closed, the beam was lost, or these frames were never written to the file. {they_are} left "
+        f"out{gap}."
     )
 
 

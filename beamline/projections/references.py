@@ -106,10 +106,10 @@ def read_references(scan: SelectedScan, rows: slice) -> tuple[References, str]:
             net = (1 - mean_scale) * dark if own is dark or own is None else dark - mean_scale * own
             flats.append((float(used.mean()), (mean + net).astype(np.float32)))
     if dark is None or not flats:
+        frames_kind = "darks" if dark is None else "flats"
         raise DataError(
-            f"{scan.source.path}: all {'darks' if dark is None else 'flats'} are damaged: each frame is "
-            "unreadable or differs from its stored checksum. Use an intact copy of the file. --flags "
-            "ignore uses the frames whose checksum differs."
+            f"{scan.source.path}: all {frames_kind} are damaged: each frame is unreadable or differs from its stored "
+            "checksum. Use an intact copy of the file. --flags ignore uses the frames whose checksum differs."
         )
     note = ""
     if reading.spots:
@@ -192,10 +192,11 @@ def uncorrected_current(scan: SelectedScan) -> str:
     currents = known[scan.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)]
     if not currents.size or not (currents > 0).all() or currents.max() < (1 + _STEADY) * currents.min():
         return ""
+    variation = currents.max() / currents.min() - 1
     return (
-        "Use --ring-current use: the ring current of flats and projections (control/data) varies by "
-        f"{currents.max() / currents.min() - 1:.0%} (from {currents.min():.6g} to {currents.max():.6g}), "
-        "and there is no air next to the sample to correct this."
+        f"Use --ring-current use: the ring current of flats and projections (control/data) varies by {variation:.0%} "
+        f"(from {currents.min():.6g} to {currents.max():.6g}), and there is no air next to the sample to correct "
+        "this."
     )
 
 
@@ -234,9 +235,9 @@ def parts_without_flats(scan: ScanEvidence, references: References) -> list[str]
     for start, end in zip(starts, [*starts[1:], len(scan.table)], strict=True):
         has_views = scan.table.views_of(start, end).size
         if has_views and not any(start <= position < end for position in flats):
+            last = end - 1
             warnings.append(
-                f"Frames {start}-{end - 1}, a part of the scan, have no usable flats. Their projections "
-                "are corrected with the nearest flats of another part, although the beam may have "
-                "changed."
+                f"Frames {start}-{last}, a part of the scan, have no usable flats. Their projections are corrected "
+                "with the nearest flats of another part, although the beam may have changed."
             )
     return warnings

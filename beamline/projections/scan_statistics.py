@@ -183,9 +183,8 @@ class Light:
         each = f"{self.photons:.4g} photons per pixel and projection in the open beam"
         out = [f"{each}, {self.photons * self.views:.4g} in {self.views} projections"]
         if self.gray is not None:
-            out.append(
-                f"{self.gray * self.views:.4g} Gy absorbed in {self.material}, at its surface, in all projections"
-            )
+            total_gray = self.gray * self.views
+            out.append(f"{total_gray:.4g} Gy absorbed in {self.material}, at its surface, in all projections")
         return out
 
 

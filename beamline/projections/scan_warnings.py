@@ -39,10 +39,13 @@ def warn_of_units(scan: SelectedScan, warn: Warn) -> None:
     if turned := source.attributes.get("turned"):
         warn(Note(str(turned)))
     if (cone := selection.cone or source.cone) is not None and cone[1] < _LEAST_MAGNIFICATION * cone[0]:
+        sod = cone[0]
+        sdd = cone[1]
+        magnification = cone[1] / cone[0]
         warn(
-            "Check --cone SOD:SDD. SDD is the distance from the source to the detector, not from the "
-            f"axis to the detector. With the present values, {cone[0]:g} mm from the source to the axis "
-            f"and {cone[1]:g} mm to the detector, the cone magnifies only {cone[1] / cone[0]:.4g} times."
+            "Check --cone SOD:SDD. SDD is the distance from the source to the detector, not from the axis to the "
+            f"detector. With the present values, {sod:g} mm from the source to the axis and {sdd:g} mm to the "
+            f"detector, the cone magnifies only {magnification:.4g} times."
         )
 
 
@@ -174,8 +177,9 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
     ):
         if dead_rows.size:
             result = so if what == "slice" else "not used, and voxels that other rows do not show are 0"
+            row_numbers = spans(dead_rows.tolist())
             warn(
-                f"No data in {count(dead_rows.size, what)} of {len(masked)} (counted from 0: "
-                f"{spans(dead_rows.tolist())}), because in all projections these detector rows have no beam, zeros, "
-                f"no finite values, or dead pixels. These {what}s are {result}."
+                f"No data in {count(dead_rows.size, what)} of {len(masked)} (counted from 0: {row_numbers}), because "
+                "in all projections these detector rows have no beam, zeros, no finite values, or dead pixels. "
+                f"These {what}s are {result}."
             )

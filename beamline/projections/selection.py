@@ -90,9 +90,10 @@ class Selection:
             size_mm, whose = source.pixel_size_mm, str(source.path)
         low, high = _PIXEL_SIZES_UM
         if size_mm is not None and not low <= size_mm * 1e3 <= high:
+            size_um = size_mm * 1e3
             raise ConfigError(
-                f"{whose}: a pixel size of {size_mm * 1e3:.4g} um is impossible; expected {low:g} to {high:g} um. "
-                "Give the right pixel size with --pixel-size-um."
+                f"{whose}: a pixel size of {size_um:.4g} um is impossible; expected {low:g} to {high:g} um. Give the "
+                "right pixel size with --pixel-size-um."
             )
         width = source.attributes.get("sample_diameter_mm") if size_mm is not None else None
         width = width if self.sample_width is None else self.sample_width
@@ -125,7 +126,8 @@ class ScanSelection(Selection):
         if not 0 <= first < end <= height:
             raise ConfigError(f"--rows {first}:{end} is out of range: the detector has rows 0:{height}.")
         if not 1 <= n <= min(end - first, width):
-            raise ConfigError(f"--bin {n} does not fit into {end - first} rows of {width} columns.")
+            n_rows = end - first
+            raise ConfigError(f"--bin {n} does not fit into {n_rows} rows of {width} columns.")
         object.__setattr__(self, "rows", (first, first + (end - first) // n * n))
 
     @property
@@ -164,9 +166,8 @@ class ScanSelection(Selection):
             meets = (self.shape[0] - 1) / 2 if self.central_row is None else self.central_row
             try:
                 if self.cone[1] < (width := full[1] * pitch) / math.sqrt(2):
-                    raise ValueError(
-                        f"the source would be only {self.cone[1]:g} mm from a detector that is {width:.4g} mm wide"
-                    )
+                    sdd = self.cone[1]
+                    raise ValueError(f"the source would be only {sdd:g} mm from a detector that is {width:.4g} mm wide")
                 geometry = Geometry.cone(
                     angles, full, pitch, *self.cone, axis_col=axis_col, axis_row=meets - rows.start
                 )  # fmt: skip

@@ -40,11 +40,11 @@ def warn_of_tilt(plan: ScanCorrectionPlan, frames: NDArray[np.int64], warn: Warn
     except (ValueError, DataError):
         return  # the tilt could not be measured, and the user did not ask for it
     if abs(shown.tilt) * rows > MATTERS and abs(shown.tilt) > _SURE * shown.uncertainty:
+        offset_px = abs(shown.tilt) * rows
         warn(
-            "Give --tilt auto (or --tilt 0 if the axis is straight): the rotation axis seems to be "
-            f"tilted in the detector's plane by {tilt_text(shown.tilt, shown.uncertainty)}, "
-            f"{abs(shown.tilt) * rows:.1f} px over {rows} rows. This doubles edges in the first and last "
-            "slices."
+            "Give --tilt auto (or --tilt 0 if the axis is straight): the rotation axis seems to be tilted in the "
+            f"detector's plane by {tilt_text(shown.tilt, shown.uncertainty)}, {offset_px:.1f} px over {rows} rows. "
+            "This doubles edges in the first and last slices."
         )
 
 

@@ -142,7 +142,9 @@ def usable_views(scan: ScanEvidence, use_flags: bool) -> UsableViews:
         return UsableViews(scan, rows, flags=flags)
     if not use_flags:
         alarmed, warned = views & flags.alarmed, views & flags.flagged & ~flags.alarmed
-        n = f"{count(int(alarmed.sum()), 'projection')} with an alarm and {warned.sum()} with a warning"
+        with_alarm = count(int(alarmed.sum()), "projection")
+        n_warned = warned.sum()
+        n = f"{with_alarm} with an alarm and {n_warned} with a warning"
         sentence = f"--flags ignore: {n} are used as they are."
         return UsableViews(scan, rows, sentence=sentence, flags=flags)
     treated = flag_policy(flags, views, scan.source.shape)

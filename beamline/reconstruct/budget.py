@@ -46,9 +46,10 @@ def in_budget(
         affordable.remove(max(affordable, key=lambda each: seconds[each.name]))
         chosen = _without_slow(method, affordable)
     if (late := expected - (end - now())) > 0:
+        fastest_name = affordable[0].name
         warn(
-            f"{duration_text(budget)} is too short for this scan: even the fastest method, {affordable[0].name}, which "
-            f"is used now, will end about {duration_text(late)} after this limit."
+            f"{duration_text(budget)} is too short for this scan: even the fastest method, {fastest_name}, which is "
+            f"used now, will end about {duration_text(late)} after this limit."
         )
     names = [each.name for each in affordable]
     out = [

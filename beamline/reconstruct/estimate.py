@@ -52,7 +52,8 @@ class Estimate(Need):
     def lines(self) -> list[str]:
         in_slabs = f"in {count(self.slabs, 'slab')}; a volume in one piece would need {size(self.at_once)}"
         if self.done:
-            in_slabs = f"in {count(self.slabs, 'slab')} remaining; {self.done} of {self.shape[0]} slices are done"
+            n_slices = self.shape[0]
+            in_slabs = f"in {count(self.slabs, 'slab')} remaining; {self.done} of {n_slices} slices are done"
         how = in_slabs if self.scratch else "all at once"
         *several, z, y, x = self.shape
         what = f"{'volumes':<10}{several[0]} of " if several else f"{'volume':<10}"

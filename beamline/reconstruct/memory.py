@@ -196,9 +196,10 @@ def refuse_whole(scan: SelectedScan, options: ReconOptions, needs: ReconMemory, 
     }
     for option, used in whole.items():
         if used:
+            larger_bin = 2 * options.selection.binning
             raise ConfigError(
                 f"{option} needs the whole scan in memory: {scan.source.path} needs {size(needs.at_once)}, but "
-                f"{size(memory)} is allowed. Leave out this option, or use --bin {2 * options.selection.binning} "
+                f"{size(memory)} is allowed. Leave out this option, or use --bin {larger_bin} "
                 "or --rows."
             )
 
@@ -209,10 +210,13 @@ def refuse_smallest(source: ScanSource, needs: ReconMemory, memory: int, binning
         return
     cheaper = replace(needs, method=Fbp(), weighted=False).least <= memory
     largest_part = max(needs.parts, key=needs.parts.__getitem__)
+    needed_mb = math.ceil(needs.least / 1e6)
+    larger_bin = 2 * binning
+    or_fbp = ", or -m fbp" if cheaper else ""
     raise DataError(
         f"{source.path}: {largest_part} needs {size(needs.least)} of memory, but {size(memory)} is allowed. Use "
-        f"--memory {math.ceil(needs.least / 1e6)}M if the computer has this much memory, or --bin "
-        f"{2 * binning}{', or -m fbp' if cheaper else ''}. Nothing was written."
+        f"--memory {needed_mb}M if the computer has this much memory, or --bin {larger_bin}{or_fbp}. Nothing was "
+        "written."
     )
 
 

@@ -266,7 +266,8 @@ def _for_method(
     if options.method.stops_early and not prepared.lines.held_out.size:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
         n, total = prepared.n_used, prepared.origin.n_projections
-        message = f"{total - n} of {total} projections are held out to decide when to stop"
+        n_held_out = total - n
+        message = f"{n_held_out} of {total} projections are held out to decide when to stop"
         channels.sink(StateEntered("held_out", message, time=channels.clock.now()))
     options.target.require_room(plan.output, plan.scratch - plan.line_integrals)  # line integrals are stored already
     return prepared

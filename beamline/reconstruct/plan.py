@@ -194,14 +194,16 @@ def _in_slabs(source: ScanSource, options: ReconOptions, needs: ReconMemory, all
         return _plan(options, needs, allowed, slabs, slabs)
     slabs, missing = slabs_of_partial(partial)
     if slabs[-1].own.stop != slices:
+        stored_slices = slabs[-1].own.stop
         raise DataError(
-            f"{partial} contains a volume of {slabs[-1].own.stop} slices, but this reconstruction has {slices}. Use "
-            f"the options with which {partial} was written, or start again without --resume."
+            f"{partial} contains a volume of {stored_slices} slices, but this reconstruction has {slices}. Use the "
+            f"options with which {partial} was written, or start again without --resume."
         )
     if (wanted := needs.slab(slabs[0].own.stop)) > allowed:
+        needed_mb = math.ceil(wanted / 1e6)
         raise DataError(
             f"The slabs of {partial} need {size(wanted)} of memory, but {size(allowed)} is allowed. Use --memory "
-            f"{math.ceil(wanted / 1e6)}M if the computer has this much memory. No file was changed."
+            f"{needed_mb}M if the computer has this much memory. No file was changed."
         )
     return _plan(options, needs, allowed, slabs, missing)
 
@@ -236,10 +238,10 @@ def prepare_within(
     plan, buffer = planned(scan, options, needs), None
     options.target.require_room(plan.output, plan.scratch)
     if plan.slabs:
+        on_disk = size(needs.line_integrals + needs.volume)
         sentence = (
             f"Working in slabs, because the whole volume would need {size(needs.at_once)} of memory and "
-            f"{size(plan.allowed)} is allowed. Temporary files on the disk of the output take "
-            f"{size(needs.line_integrals + needs.volume)}."
+            f"{size(plan.allowed)} is allowed. Temporary files on the disk of the output take {on_disk}."
         )
         sink(StateEntered("memory", sentence, time=clock.now()))
         batch = max(1, int((_BATCH * plan.allowed - needs.steps.correcting) / needs.view))
@@ -342,9 +344,10 @@ def _refuse_file(source: ScanSource, options: ReconOptions) -> None:
             "so far, add --unfinished. Nothing was written."
         )
     if source.unpack_bytes > (allowed := memory_of(options)):
+        needed_mb = math.ceil(source.unpack_bytes / 1e6)
         raise DataError(
             f"{source.path} is stored in chunks, and unpacking one chunk needs {size(source.unpack_bytes)} of "
-            f"memory, but {size(allowed)} is allowed. Use --memory {math.ceil(source.unpack_bytes / 1e6)}M if the "
+            f"memory, but {size(allowed)} is allowed. Use --memory {needed_mb}M if the "
             "computer has this much memory, or copy the file with one frame in each chunk. Nothing was read."
         )
 

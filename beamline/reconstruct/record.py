@@ -253,10 +253,11 @@ def partly_seen_warning(geometry: Geometry) -> str:
     partial_slices = partly_seen(geometry)
     if not partial_slices.size:
         return ""
+    which = spans(partial_slices.tolist())
+    n_slices = Grid.matching(geometry).shape[0]
     return (
-        f"Slices {spans(partial_slices.tolist())} of {Grid.matching(geometry).shape[0]} are seen from fewer angles "
-        "than the others, because the projections are at different heights. The volume has streaks in these slices, "
-        "and FBP gives too low densities."
+        f"Slices {which} of {n_slices} are seen from fewer angles than the others, because the projections are at "
+        "different heights. The volume has streaks in these slices, and FBP gives too low densities."
     )
 
 

@@ -109,9 +109,10 @@ def rows_around(scan: SelectedScan, region: Region, halo: int) -> SelectedScan:
     if poses is not None and (poses.shifts[:, 1].any() or poses.leans):
         obstacles.append("--poses along the axis, or with roll, tilt or vectors")
     if obstacles:
+        options_in_the_way = " and ".join(obstacles)
         raise ConfigError(
-            f"--roi needs slices that are aligned with rows, and {' and '.join(obstacles)} may misalign them. Use "
-            f"--rows instead of --roi, or leave out {' and '.join(obstacles)}. Nothing was read."
+            f"--roi needs slices that are aligned with rows, and {options_in_the_way} may misalign them. Use "
+            f"--rows instead of --roi, or leave out {options_in_the_way}. Nothing was read."
         )
     rows, side, (first, end) = selection.detector_rows, selection.binning, region.z
     slices = (rows.stop - rows.start) // side

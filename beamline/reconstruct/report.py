@@ -78,7 +78,9 @@ def _summary(outcome: MadeVolume, metrics: Mapping[str, Mapping[str, float]]) ->
     shape, what = " × ".join(str(n) for n in result.volume.grid.shape), f"{name} volume of"
     if result.series is not None:
         seconds = result.series.seconds
-        what = f"{len(seconds)} volumes at successive times, {seconds[0]:.4g} to {seconds[-1]:.4g} s, of"
+        first_time = seconds[0]
+        last_time = seconds[-1]
+        what = f"{len(seconds)} volumes at successive times, {first_time:.4g} to {last_time:.4g} s, of"
     summary = (
         f"{what} {shape} voxels from {geometry.n_views} of {prepared.origin.n_projections} projections in "
         f"{result.seconds:.1f} s; {METRICS[best].label} {formatted(best, own[best])}"
@@ -105,6 +107,7 @@ def _footnotes(
     )
     of_one = "|A x − p| / |p| over up to 16 projections p; x is the volume, A the forward projection (Joseph 1982)."
     slices = 0 if unexplained is None else len(unexplained.significance)
+    reference = "the ground truth" if truth else "FBP of these projections"
     footnotes = (
         (True, f"Residual: {of_one if result.series is None else of_several}"),
         (
@@ -113,10 +116,9 @@ def _footnotes(
         ),
         (
             any("cnr" in values for values in metrics.values()),
-            "SNR, CNR: computed from the dense and the empty part (two classes by k-means) of "
-            f"{'the ground truth' if truth else 'FBP of these projections'}, without voxels near the boundary. "
-            "All volumes use the same two parts. A smoother volume has higher values, although it may show "
-            "less: look for cracks and pores in the pictures.",
+            f"SNR, CNR: computed from the dense and the empty part (two classes by k-means) of {reference}, without "
+            "voxels near the boundary. All volumes use the same two parts. A smoother volume has higher values, "
+            "although it may show less: look for cracks and pores in the pictures.",
         ),
         (
             any("air" in values for values in metrics.values()),

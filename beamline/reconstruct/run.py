@@ -115,11 +115,11 @@ def fit_within(
     measuring = _MEASURING * limit
     remaining = limit - spent - measuring - after
     if remaining <= 0:
+        rest = duration_text(measuring + after)
         warn(
             f"{duration_text(limit)} is not enough for this scan: reading and correction took "
-            f"{duration_text(spent)}, and checks, report and writing need about "
-            f"{duration_text(measuring + after)}. No time is left for the {by_name(method.name).label} method, "
-            "so it makes only one step."
+            f"{duration_text(spent)}, and checks, report and writing need about {rest}. No time is left for the "
+            f"{by_name(method.name).label} method, so it makes only one step."
         )
     before_report = Stop(deadline=started[0] + limit - after, now=clock.now)
     return with_settings(method, {"seconds": max(remaining, 0.0)}), before_report
@@ -140,10 +140,10 @@ DecisionValues = Mapping[str, Sequence[Any]]
 def refuse_impossible(options: ReconOptions) -> None:
     """Raise ConfigError, before any work, if error bars cannot be computed or written."""
     if not all(method.error_bars for method in options.method.alternatives):
+        possible_methods = ", ".join(names_where(lambda each: each.error_bars))
         raise ConfigError(
-            f"--uncertainty does not work with {options.method.name}, only with "
-            f"{', '.join(names_where(lambda each: each.error_bars))}. Leave out --uncertainty, or choose another "
-            "method."
+            f"--uncertainty does not work with {options.method.name}, only with {possible_methods}. Leave out "
+            "--uncertainty, or choose another method."
         )
     if options.target.written and options.target.output.suffix.lower() not in SUFFIXES:
         raise ConfigError(

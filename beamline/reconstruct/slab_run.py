@@ -111,7 +111,9 @@ class _SlabJob:
 
     def announce(self, n: int) -> None:
         own = self.slabs[n].own
-        self.say(f"Slab {n + 1} of {len(self.slabs)}: slices {own.start} to {own.stop - 1}.")
+        number = n + 1
+        last_slice = own.stop - 1
+        self.say(f"Slab {number} of {len(self.slabs)}: slices {own.start} to {last_slice}.")
 
     def tell(self, done: int) -> None:
         """Report the number of finished slices."""

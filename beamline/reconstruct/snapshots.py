@@ -122,9 +122,10 @@ class Snapshots:
         return Fbp.name if shown.direct else fit, errors
 
     def _rows(self, fit: StreamingFit, volume: Volume, shown: str) -> tuple[PictureRow, ...]:
+        elapsed = self._clock.now() - self._begin
         heading = (
-            f"{fit.n_views} projections so far, {shown}; {fit.progress().n_gaussians} Gaussians, "
-            f"{self._clock.now() - self._begin:.0f} s after the start"
+            f"{fit.n_views} projections so far, {shown}; {fit.progress().n_gaussians} Gaussians, {elapsed:.0f} s "
+            "after the start"
         )
         return volume_rows(volume, *fit.newest_view(), heading, self.unit, (self._centre, self._unseen))
 

@@ -52,7 +52,8 @@ def _volume_in(path: Path) -> str | None:
     with hdf5.open_hdf5(path) as file:
         dataset = next((p for p in _VOLUME_PATHS if getattr(file.get(p), "ndim", 0) == 3), None)
     if dataset is None:
-        raise DataError(f"expected a 3-D dataset at one of {', '.join(_VOLUME_PATHS)}")
+        places = ", ".join(_VOLUME_PATHS)
+        raise DataError(f"expected a 3-D dataset at one of {places}")
     return dataset
 
 

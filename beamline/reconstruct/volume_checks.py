@@ -99,7 +99,8 @@ def check_volume(outcome: MadeVolume, sink: Sink, clock: Clock) -> CheckedVolume
         tell(_lost_material(result, prepared, volumes[BASELINE]))
     if skipped:
         why = "the reconstruction was stopped" if result.ending.early else "the time limit was nearly reached"
-        text = f"These checks were left out, because {why}: {', '.join(skipped)}."
+        skipped_checks = ", ".join(skipped)
+        text = f"These checks were left out, because {why}: {skipped_checks}."
         sink(StateEntered("left_out", text, time=clock.now()))
     return CheckedVolume(judgement, volumes, metrics, warnings, hiding, text if skipped else "")
 
@@ -140,10 +141,11 @@ def _sample_radius(result: Reconstruction, prepared: PreparedProjections) -> str
             else ""
         )
         sure = f" Densities near the axis are uncertain by {density:.1%} or more{advice}."
+    ratio = radius / reach
     return Note(
         f"The sample is wider than the field of view: its radius about the rotation axis is {radius:.4g} {unit}, "
-        f"{radius / reach:.2f} times the radius of the field of view ({known}). The whole sample was "
-        f"reconstructed, but only the part in the field of view is written.{sure}"
+        f"{ratio:.2f} times the radius of the field of view ({known}). The whole sample was reconstructed, but only "
+        f"the part in the field of view is written.{sure}"
     )
 
 
@@ -217,10 +219,11 @@ def odd_views_warning(odd: Sequence[OddView], outcome: MadeVolume) -> str:
             f"absorbs {more_or_less} than the volume)"
         )
     more = f"; and {len(odd) - _NAMED} more" if len(odd) > _NAMED else ""
+    where = "; ".join(places)
     return (
         "Look at these frames, because something crossed the beam or the sample moved: a part of "
         f"{count(len(odd), 'projection')} differs from the volume by more than {LIMIT:g} times the usual difference "
-        f"between projections and volume: {'; '.join(places)}{more}."
+        f"between projections and volume: {where}{more}."
     )
 
 

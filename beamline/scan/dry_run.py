@@ -87,8 +87,10 @@ class DryRun:
         lines = describe_timeline(self.plan, self.timeline, self.stage, self.camera, free_bytes=self.free_bytes)
         each, needs = self.energies, self.needs
         if each:
+            lowest = each[0].kev
+            highest = each[-1].kev
             sentence = (
-                f"{len(each)}, {each[0].kev:.7g} to {each[-1].kev:.7g} keV, one scan like this at each energy: "
+                f"{len(each)}, {lowest:.7g} to {highest:.7g} keV, one scan like this at each energy: "
                 f"{hms_text(needs.duration)} and {size(needs.total_bytes)} in total (without the moves of the "
                 "monochromator)"
             )
@@ -160,16 +162,17 @@ def _doubt_optics(config: Config) -> str:
     settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
     # half of the width of the field of view, in mm
     half = 5e-4 * optics.pixel_size_um * camera.binning * camera.timing_of(settings).shape[1]
+    field_of_view = 2 * half
     if optics.pixel_size_um > _DEMAGNIFIED * own:
         return (
             f"optics.pixel_size_um is {optics.pixel_size_um:g} um, but the camera's pixels are {own:g} um: the field "
-            f"of view would be {2 * half:.4g} mm wide. The setting is the size of an unbinned pixel at the sample, "
-            "in um. Was the value given in nm?"
+            f"of view would be {field_of_view:.4g} mm wide. The setting is the size of an unbinned pixel at the "
+            "sample, in um. Was the value given in nm?"
         )
     return (
         f"optics.distance_mm is {optics.distance_mm:g} mm from sample to detector, less than half the field of view "
-        f"of {2 * half:.4g} mm: a sample as wide as the field of view could not rotate there. Was the value given in "
-        "m?"
+        f"of {field_of_view:.4g} mm: a sample as wide as the field of view could not rotate there. Was the value given "
+        "in m?"
         if optics.distance_mm and optics.distance_mm < half
         else ""
     )
@@ -302,7 +305,8 @@ def refuse_violations(worked: Timeline) -> None:
     """Raise ConfigError with all violated limits, if there are any."""
     broken = worked.violations
     if len(broken) == 1:
-        raise ConfigError(f"a limit is exceeded, nothing was started: {broken[0]}.")
+        first_limit = broken[0]
+        raise ConfigError(f"a limit is exceeded, nothing was started: {first_limit}.")
     if broken:
         raise ConfigError("\n  ".join([f"{len(broken)} limits are exceeded, nothing was started:", *broken]))
 

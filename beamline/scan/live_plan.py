@@ -96,7 +96,8 @@ def live_need(shape: tuple[int, int], n_views: int, free: int) -> str:
     how += [f"pixels binned {plan.binning} x {plan.binning}"] if plan.binning > 1 else []
     whole = f"all {n_views} projections of {shape[0]} x {shape[1]} would need {size(live_bytes(shape, n_views))}"
     wide = f"at most {_WIDEST} columns and " if shape[1] > _WIDEST else ""
+    what_to_change = ", ".join(how)
     return (
-        f"{need} ({', '.join(how)}). The reason: the live volume may use {wide}{most}, but {whole}. `beamline recon` "
+        f"{need} ({what_to_change}). The reason: the live volume may use {wide}{most}, but {whole}. `beamline recon` "
         "makes the full volume"
     )

@@ -306,11 +306,11 @@ def _wait_for(follower: LiveReconstruction | None, stop: StopRequest, states: St
 
 def _stopped_sentence(faults: Iterable[str], n_frames: int) -> str:
     """Why no projection was taken, and what to do."""
+    fault_text = " ".join(faults)
     return (
-        "Stopped before the first projection, because the darks or flats cannot be used. "
-        f"{' '.join(faults)} The shutter was told to close; the {n_frames} darks and flats "
-        "are in the file. Fix the fault, check a few frames and the exposure with `beamline tune`, and "
-        "start the scan again. To scan anyway, set references.on_fault: log."
+        f"Stopped before the first projection, because the darks or flats cannot be used. {fault_text} The shutter "
+        f"was told to close; the {n_frames} darks and flats are in the file. Fix the fault, check a few frames and "
+        "the exposure with `beamline tune`, and start the scan again. To scan anyway, set references.on_fault: log."
     )
 
 

@@ -75,10 +75,11 @@ def looked_again(stage: RotationStage, angle: float, before: float) -> tuple[flo
     wanted, most = stage.to_counts(angle), stage.limits.tolerance
     if not moving and all(abs(stage.to_counts(place) - wanted) <= most for place in (before, after)):
         return (before + after) / 2, ""
+    motion = "is moving " if moving else ""
     return after, (
-        f"the frame was exposed while the stage was not at the planned angle of {math.degrees(angle):.4f}°, "
-        f"although it had reported its arrival there: it was at {math.degrees(before):.4f}° before the exposure "
-        f"and {'is moving ' if moving else ''}at {math.degrees(after):.4f}° after it. {ASTRAY_ADVICE}"
+        f"the frame was exposed while the stage was not at the planned angle of {math.degrees(angle):.4f}°, although "
+        f"it had reported its arrival there: it was at {math.degrees(before):.4f}° before the exposure and "
+        f"{motion}at {math.degrees(after):.4f}° after it. {ASTRAY_ADVICE}"
     )
 
 
@@ -118,11 +119,13 @@ def require_in_place(looks: dict[str, Callable[[], str]], kind: FrameKind, rows:
     """Raise InstrumentError if a device has left the position that it had before a block."""
     moved = {name: problem for name, look in looks.items() if (problem := look())}
     if moved and rows and not stop.aborting:
+        how_many = count(len(rows), kind.name.lower())
+        row_numbers = spans(list(rows))
         raise InstrumentError(
             f"{'; '.join(f'{name}: {problem}' for name, problem in moved.items())}. The device was moved while "
-            f"{count(len(rows), kind.name.lower())} (frames {spans(list(rows))} of the file) were taken. "
-            "Do not use these frames, because it is not known which of them are affected. Find out who "
-            "or what moved the device, move it back, and repeat the scan. Frames taken before are good."
+            f"{how_many} (frames {row_numbers} of the file) were taken. Do not use these frames, because it is not "
+            "known which of them are affected. Find out who or what moved the device, move it back, and repeat the "
+            "scan. Frames taken before are good."
         )
 
 

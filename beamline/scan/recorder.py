@@ -161,9 +161,8 @@ class Recorder:
         if isinstance(cause, BeamlineError):
             raise cause
         if cause is not None:
-            raise DataError(
-                f"A frame could not be written: {user_message(cause).rstrip('.')}. {self._safe()}"
-            ) from cause
+            reason = user_message(cause).rstrip(".")
+            raise DataError(f"A frame could not be written: {reason}. {self._safe()}") from cause
 
     def _fails(self) -> bool:
         return self._failure is not None

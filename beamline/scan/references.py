@@ -95,12 +95,14 @@ class ReferenceLog:
         n_photons *= exposure / flats[0].exposure if flats[0].exposure > 0 else 1.0
         if not n_photons < FEW_PHOTONS:
             return None
+        longer_exposure = exposure * FEW_PHOTONS / n_photons
+        flat_frames = spans([flat.row for flat in flats])
         return (
-            f"Expose for longer (scan.exposure_s={exposure * FEW_PHOTONS / n_photons:.2g}, and scan.period_s to "
-            "match), or bin the camera's pixels (devices.camera.binning): the beam is too weak. A pixel of the open "
-            f"beam has {n_photons:.3g} photons per projection (from mean and variance of the flats "
-            f"{spans([flat.row for flat in flats])}); expected {FEW_PHOTONS} or more, otherwise noise dominates the "
-            "volume. `beamline tune` measures the photons per pixel."
+            f"Expose for longer (scan.exposure_s={longer_exposure:.2g}, and scan.period_s to match), or bin the "
+            "camera's pixels (devices.camera.binning): the beam is too weak. A pixel of the open beam has "
+            f"{n_photons:.3g} photons per projection (from mean and variance of the flats {flat_frames}); expected "
+            f"{FEW_PHOTONS} or more, otherwise noise dominates the volume. `beamline tune` measures the photons per "
+            "pixel."
         )
 
 

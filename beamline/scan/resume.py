@@ -88,9 +88,10 @@ class ResumableRun:
             kinds = ["offset projections"] if self.offset_missing else []
             kinds += [f"{kind.name.lower()}s" for kind in sorted(self.end_references)]
             all_views = "the projections that were planned" if self.choices else f"{self.planned} projections"
+            missing_kinds = " and ".join(kinds)
             return (
-                f"Preparing: {self.run} has all {all_views}; the {' and '.join(kinds)} that are missing at its "
-                "end are taken now"
+                f"Preparing: {self.run} has all {all_views}; the {missing_kinds} that are missing at its end are "
+                "taken now"
             )
         if self.choices:  # some projections were omitted by a decision, or are taken twice
             return f"Preparing: {missing} of the projections planned for {self.run} are missing and are taken now"

@@ -40,11 +40,11 @@ class Retakes:
         if not chosen:
             return ()
         if len(chosen) < n_bad:
+            n_left = n_bad - len(chosen)
             self.sink(
                 Warned(
-                    f"{n_bad} projections were flagged or gave no frame, but only {len(chosen)} may be "
-                    f"taken again (monitor.retake_share). The other {n_bad - len(chosen)} remain as they "
-                    "are."
+                    f"{n_bad} projections were flagged or gave no frame, but only {len(chosen)} may be taken again "
+                    f"(monitor.retake_share). The other {n_left} remain as they are."
                 )
             )
         seconds = self.timeline.retake_seconds * len(chosen) / self.timeline.plan.retakes

@@ -100,9 +100,10 @@ def astray_views(taken: BlockTally) -> str:
     ]
     more = f", and {len(taken.astray) - NAMED} more" if len(taken.astray) > NAMED else ""
     n_exposures, n_projections = sum(map(len, taken.astray.values())), len(taken.astray)
+    where_text = ", ".join(where)
     return (
         f"The stage was not at its angle in {n_exposures} exposures of {n_projections} projections "
-        f"({', '.join(where)}{more}). {ASTRAY_ADVICE}."
+        f"({where_text}{more}). {ASTRAY_ADVICE}."
     )
 
 

@@ -121,9 +121,11 @@ def numpy_arrays(path: Path, mapped: Literal["r"] | None = None) -> dict[str, ND
 def require_room(path: Path, n: int) -> None:
     """Raise DataError if `n` bytes exceed the free memory. A damaged file may state any size."""
     if n > (free := free_memory()):
+        needed_gb = n / 1e9
+        free_gb = free / 1e9
         raise DataError(
-            f"{path} does not fit in memory: its header states {n / 1e9:.3g} GB, and {free / 1e9:.3g} GB "
-            "are free. Crop or bin the volume."
+            f"{path} does not fit in memory: its header states {needed_gb:.3g} GB, and {free_gb:.3g} GB are free. "
+            "Crop or bin the volume."
         )
 
 

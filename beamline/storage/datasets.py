@@ -111,9 +111,11 @@ def values_of(item: h5py.Dataset) -> Any:
     BRIEF bytes.
     """
     if (n := (item.size or 0) * item.dtype.itemsize) > BRIEF:
+        size_gb = n / 1e9
+        limit_gb = BRIEF / 1e9
         raise DataError(
-            f"{item.name} in {item.file.filename} contains {n / 1e9:.3g} GB; expected a number, a text or "
-            f"a list of at most {BRIEF / 1e9:.3g} GB. Nothing was read."
+            f"{item.name} in {item.file.filename} contains {size_gb:.3g} GB; expected a number, a text or a list of "
+            f"at most {limit_gb:.3g} GB. Nothing was read."
         )
     return read_part(item, ())
 
@@ -288,8 +290,10 @@ def radians(item: h5py.Dataset, unit: str | None = None, default: str = "") -> N
             or `default` if neither states a unit.
     """
     if lost := missing_links(item):
+        linked_file = lost[0]
         raise DataError(
-            f"{item.file.filename} takes its angles from {lost[0]}, which is missing or has another shape than stated."
+            f"{item.file.filename} takes its angles from {linked_file}, which is missing or has another shape than "
+            "stated."
         )
     where = f"{item.name} in {item.file.filename}"
     angles, stated = _numbers(item)
@@ -353,11 +357,11 @@ def missing_links(item: h5py.Dataset, whole: dict[tuple[str, str], bool] | None 
                     continue
         lost.add(where if name == "." else str(path))
     if packed:
+        first_packed = packed[0]
         raise DataError(
-            f"{item.name} in {item.file.filename} is a virtual dataset. The values behind it, "
-            f"{packed[0]}, are packed (attributes scale_factor, ...), and a virtual dataset returns them "
-            "without unpacking. In a copy of the file, give the virtual dataset the same attributes, or "
-            "store unpacked values. Nothing was read."
+            f"{item.name} in {item.file.filename} is a virtual dataset. The values behind it, {first_packed}, are "
+            "packed (attributes scale_factor, ...), and a virtual dataset returns them without unpacking. In a copy "
+            "of the file, give the virtual dataset the same attributes, or store unpacked values. Nothing was read."
         )
     return sorted(lost)
 
@@ -388,20 +392,23 @@ def require_possible(item: Any) -> int:
         DataError: the frames have no pixels, or they are larger than any detector or than the free memory.
     """
     if 0 in item.shape[1:]:
-        raise DataError(f"{item.name} in {item.file.filename} has frames of {item.shape[1]} x {item.shape[2]} pixels.")
+        n_rows = item.shape[1]
+        n_cols = item.shape[2]
+        raise DataError(f"{item.name} in {item.file.filename} has frames of {n_rows} x {n_cols} pixels.")
     if item.shape[0] > _FRAMES or item.shape[1] * item.shape[2] > _PIXELS:
+        item_shape = " x ".join(map(str, item.shape))
         raise DataError(
-            f"{item.name} in {item.file.filename} is {' x '.join(map(str, item.shape))}; expected at most {_FRAMES} "
-            f"frames of {_PIXELS} pixels."
+            f"{item.name} in {item.file.filename} is {item_shape}; expected at most {_FRAMES} frames of {_PIXELS} "
+            "pixels."
         )
     stored = getattr(item, "item", item)  # chunks of a Zarr are usually compressed
     packed = stored.id.get_create_plist().get_nfilters() if isinstance(stored, h5py.Dataset) else bool(stored.chunks)
     if (needed := _UNPACKING * piece_of(item) if packed else 0) > HELD and needed > (free := free_memory()):
+        chunk_size = size(piece_of(item))
         raise DataError(
-            f"{item.name} in {item.file.filename} is stored in chunks of {size(piece_of(item))}: "
-            f"unpacking one needs {size(needed)} of memory, and {size(free)} are free. On a computer with "
-            "more memory, copy the file with one frame per chunk (h5repack -l CHUNK=...). Nothing was "
-            "read."
+            f"{item.name} in {item.file.filename} is stored in chunks of {chunk_size}: unpacking one needs "
+            f"{size(needed)} of memory, and {size(free)} are free. On a computer with more memory, copy the file "
+            "with one frame per chunk (h5repack -l CHUNK=...). Nothing was read."
         )
     return needed
 
@@ -439,4 +446,5 @@ _SORTS = {"c": "complex numbers", "b": "Boolean values", "V": "records", "O": "t
 def require_real(dtype: np.dtype[Any], what: str) -> None:
     """Raise DataError if pixels, keys or angles are not real numbers, for example text or complex numbers."""
     if dtype.kind not in "uif":
-        raise DataError(f"{what} contains {_SORTS.get(dtype.kind, str(dtype))}; expected integers or real numbers.")
+        found = _SORTS.get(dtype.kind, str(dtype))
+        raise DataError(f"{what} contains {found}; expected integers or real numbers.")

@@ -189,9 +189,10 @@ def reserve(descriptor: int, wanted: int, folder: Path) -> None:
     """
     there, free = os.fstat(descriptor), shutil.disk_usage(folder).free
     taken = 512 * getattr(there, "st_blocks", (there.st_size + 511) // 512)
+    still_needed = size(wanted - taken)
     refusal = (
-        f"Write the output to another disk: {folder} has {size(free)} free, and {size(wanted - taken)} "
-        "more are needed during the reconstruction. Nothing was written."
+        f"Write the output to another disk: {folder} has {size(free)} free, and {still_needed} more are needed "
+        "during the reconstruction. Nothing was written."
     )
     if wanted - taken > free:
         raise DataError(refusal)

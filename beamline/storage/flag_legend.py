@@ -261,7 +261,8 @@ def read_legend(file: h5py.File) -> tuple[FlagBit, ...]:
     )
     bits = [entry.bit for entry in legend]
     if len({*bits}) != len(bits) or any(not 0 <= bit < 64 - ALARM_SHIFT for bit in bits):
-        raise ValueError(f"the bits of {LEGEND} are {bits}; expected different bits from 0 to {63 - ALARM_SHIFT}")
+        last_bit = 63 - ALARM_SHIFT
+        raise ValueError(f"the bits of {LEGEND} are {bits}; expected different bits from 0 to {last_bit}")
     return legend
 
 

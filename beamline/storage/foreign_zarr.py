@@ -113,7 +113,8 @@ def _require_chunks(path: Path, array: Any) -> None:
     except ValueError as error:
         raise DataError(f"{path} cannot be read as a Zarr ({error}).") from error
     if piece > free_memory():
-        raise DataError(f"{path} has chunks of {piece / 1e9:.3g} GB, which is more than the free memory.")
+        chunk_gb = piece / 1e9
+        raise DataError(f"{path} has chunks of {chunk_gb:.3g} GB, which is more than the free memory.")
 
 
 def _spacing(image: Mapping[str, Any], axes: int, name: str) -> Spacing | None:

@@ -91,7 +91,8 @@ def _no_run(folder: Path, wanted: str) -> Path:
             f"{folder} is the folder of a run without a {wanted}, because the run ended before its first frame."
         )
     if runs := sorted(log.parent for log in folder.glob(f"*/{EVENTS}")):
-        raise DataError(f"{folder} contains several runs. Name one of them, such as {runs[-1]}.")
+        newest = runs[-1]
+        raise DataError(f"{folder} contains several runs. Name one of them, such as {newest}.")
     return folder
 
 

@@ -96,13 +96,15 @@ class PoseTable:
         if steep.any():
             row = int(np.flatnonzero(steep.any(axis=1))[0])
             roll, tilt = self.turns_deg[row]
+            projection = self.keys[row]
             raise ValueError(
-                f"{self.path}: {self.by} {self.keys[row]:g} has a roll of {roll:g} and a tilt of {tilt:g} degrees; "
+                f"{self.path}: {self.by} {projection:g} has a roll of {roll:g} and a tilt of {tilt:g} degrees; "
                 f"expected at most 180 and {_STEEPEST:g}"
             )
         ordered, counts = np.unique(self.keys, return_counts=True)
         if (counts > 1).any():
-            raise ValueError(f"{self.path}: {self.by} {ordered[counts > 1][0]:g} has {counts.max()} rows; expected one")
+            repeated = ordered[counts > 1][0]
+            raise ValueError(f"{self.path}: {self.by} {repeated:g} has {counts.max()} rows; expected one")
 
 
 class _NoPosesError(Exception):
@@ -171,7 +173,8 @@ def _require_header(path: Path, names: list[str], cone: bool | None) -> None:
     legal = (*_KEYS, *stated, *(_FOR_PEOPLE if cone is None else ()))
     for name in names:
         if name not in legal or names.count(name) > 1:
-            raise ValueError(f"{path}: column {name!r} is unknown or occurs twice; known: {', '.join(legal)}")
+            known_names = ", ".join(legal)
+            raise ValueError(f"{path}: column {name!r} is unknown or occurs twice; known: {known_names}")
 
 
 def _numbers(path: Path, names: list[str], rows: list[list[str]]) -> F64:
@@ -275,9 +278,8 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
             )
         values = np.broadcast_to(values * unit, kinds.shape)
         if not np.isfinite(values[shown]).all():
-            raise _NoPosesError(
-                f"{path}: {item.name} is not finite in {(~np.isfinite(values[shown])).sum()} projections"
-            )
+            n_bad = (~np.isfinite(values[shown])).sum()
+            raise _NoPosesError(f"{path}: {item.name} is not finite in {n_bad} projections")
         moved[axis] = values - np.median(values[shown])
     if not moved:
         raise _NoPosesError(

@@ -158,4 +158,5 @@ def require_earlier(replaces: NDArray[np.integer[Any]]) -> None:
     wrong = np.flatnonzero(replaces >= np.arange(replaces.size))
     if wrong.size:
         row = int(wrong[0])
-        raise ValueError(f"row {row} claims to replace row {replaces[row]}; only an earlier row can be replaced")
+        replaced_row = replaces[row]
+        raise ValueError(f"row {row} claims to replace row {replaced_row}; only an earlier row can be replaced")

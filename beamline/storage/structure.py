@@ -88,9 +88,10 @@ def _refuse_claim(dataset: Any, properties: Any, what: str) -> None:
     values are plain bytes in another file, because this could be any file that the user may read.
     """
     if properties.get_external_count():
+        other_file = os.fsdecode(properties.get_external(0)[0])
         raise DataError(
-            f"{what} has its values in {os.fsdecode(properties.get_external(0)[0])}, which is not an HDF5 file "
-            "and is not read. Copy the values into the dataset. Nothing was read."
+            f"{what} has its values in {other_file}, which is not an HDF5 file and is not read. Copy the values into "
+            "the dataset. Nothing was read."
         )
     chunk, shape = properties.get_chunk() if properties.get_layout() == h5py.h5d.CHUNKED else (), dataset.shape or ()
     sides = [-(-side // across) * across for side, across in zip(shape, chunk, strict=True)] if chunk else shape
@@ -98,7 +99,8 @@ def _refuse_claim(dataset: Any, properties: Any, what: str) -> None:
     if (n < CLAIMED and piece <= _LARGE) or properties.get_layout() == h5py.h5d.VIRTUAL:
         return
     if n > PACKED * (stored := dataset.get_storage_size()) or is_blank(n, stored, piece):
-        raise DataError(f"{what} states {n / 1e9:.3g} GB, but only {stored} bytes are stored. Nothing was read.")
+        claimed_gb = n / 1e9
+        raise DataError(f"{what} states {claimed_gb:.3g} GB, but only {stored} bytes are stored. Nothing was read.")
 
 
 def drawn_on(properties: Any) -> Iterator[tuple[str, str]]:
@@ -174,10 +176,8 @@ def require_held(shape: tuple[int, int, int], dtype: np.dtype[Any], begin: int, 
     """Raise ValueError unless the file has all voxels from byte `begin` on."""
     needed = math.prod(shape) * dtype.itemsize
     if begin < 0 or begin + needed > stored:
-        raise ValueError(
-            f"the header states {' x '.join(map(str, shape))} voxels from byte {begin} on, but the file "
-            f"has {stored} bytes"
-        )
+        shape_text = " x ".join(map(str, shape))
+        raise ValueError(f"the header states {shape_text} voxels from byte {begin} on, but the file has {stored} bytes")
 
 
 def require_npy(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:

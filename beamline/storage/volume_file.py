@@ -164,9 +164,10 @@ def _from_folder(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, f
             )
         )
     if others := [f"{len(some)} of {name}" for name, some in series.items() if len(some) > 1 and some is not files]:
+        example = files[0]
         raise DataError(
-            f"Put each volume into a folder of its own: {path} contains several series of images: "
-            f"{len(files)} such as {files[0]}, {', '.join(others)}."
+            f"Put each volume into a folder of its own: {path} contains several series of images: {len(files)} such "
+            f"as {example}, {', '.join(others)}."
         )
     slices: NDArray[np.generic] | None = None
     for z, name in enumerate(files):
@@ -218,7 +219,8 @@ def _from_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, fl
     if len(shape) < 3 or any(n != 1 for n in shape[3:]) or dtype.kind not in "iuf":
         raise DataError(f"{path} contains {dtype} of shape {shape}; expected real numbers with three axes.")
     if unit is None or not (np.isfinite(steps).all() and steps.all()):
-        raise DataError(f"{path} states voxels of {steps} in the unit {image.header['xyzt_units']}; expected lengths.")
+        stated_unit = image.header["xyzt_units"]
+        raise DataError(f"{path} states voxels of {steps} in the unit {stated_unit}; expected lengths.")
     require_room(path, math.prod(shape) * dtype.itemsize)
     values = np.asarray(image.dataobj).T.reshape(shape[2::-1])  # [x, y, z], then any number of axes of length 1
     x, y, z = (float(step) * unit for step in steps)

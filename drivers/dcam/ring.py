@@ -120,10 +120,11 @@ class Ring:
         self.overwritten += lost
         if not self._overrun_reported:
             self._overrun_reported = True
+            last = oldest - 1
             raise DeviceError(
                 self._device,
                 f"the ring buffer of {self._slots} frames was overrun and {lost} frames are lost: frames {first} to "
-                f"{oldest - 1} of this run, in the order of arrival",
+                f"{last} of this run, in the order of arrival",
                 expected="every frame to be read before the ring buffer overwrites it",
                 advice="Read frames faster, trigger more slowly, or give the ring buffer more memory",
                 state="Later frames can still be read",

@@ -55,9 +55,8 @@ class StageFigures(CheckedSettings):
                 f"high_deg must be above low_deg, so that the stage can move; got low_deg {low:g} and high_deg {high:g}"
             )
         if not (self.high - self.low) * self.per_radian < MOST:
-            raise ValueError(
-                f"the travel has {(self.high - self.low) * self.per_radian:g} counts, more than a float can resolve"
-            )
+            n_counts = (self.high - self.low) * self.per_radian
+            raise ValueError(f"the travel has {n_counts:g} counts, more than a float can resolve")
 
     @property
     def per_radian(self) -> float:

@@ -140,7 +140,8 @@ class Travel:
             advice = "Move to a position before the first pulse, then prepare the trigger pulses again"
         elif opening is not None and train.interval * (opening - counts) <= 0:
             problem = f"the stage is at {here}, at or past {self.degrees(opening)}, where the pulse output opens"
-            advice = f"Move back by at least {self.degrees(abs(train.interval))}, then prepare the trigger pulses again"
+            distance = self.degrees(abs(train.interval))
+            advice = f"Move back by at least {distance}, then prepare the trigger pulses again"
         else:
             return
         raise DeviceRefused(

@@ -84,8 +84,9 @@ def run_batch(scans: Sequence[Path], recipe: Path | None, folder: Path, sink: Si
     try:
         lock = WriterLock(folder / RECIPE, exclusive=True)
     except (BlockingIOError, PermissionError) as error:
+        recipe_file = folder / RECIPE
         raise DataError(
-            f"{folder / RECIPE} cannot be locked ({error.strerror}): another batch is running in this folder, or the "
+            f"{recipe_file} cannot be locked ({error.strerror}): another batch is running in this folder, or the "
             "file is write-protected. Wait until the other batch has ended, or name another folder."
         ) from error
     try:
@@ -319,4 +320,5 @@ def batch(scans: list[Path], config: Path | None, output: Path, as_json: bool) -
         every = [] if failed else [f"{len(rows)} of {len(rows)} scans have a volume{with_warnings}: {output / TABLE}"]
         answer.done(counts, *every)
     if failed:
-        raise DataError(f"{len(failed)} of {len(rows)} scans failed; {output / TABLE} says why.")
+        table_file = output / TABLE
+        raise DataError(f"{len(failed)} of {len(rows)} scans failed; {table_file} says why.")

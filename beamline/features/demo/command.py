@@ -108,8 +108,9 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         result = run_scan(config, runs, [all_but_done], stop, live=without_report, instrument=instrument)
     folder = result.path.parent
     if result.recon is None:
+        log_file = folder / RECON_LOG
         raise DataError(
-            f"The live reconstruction made no volume; the reason is in {folder / RECON_LOG}. The scan is not affected."
+            f"The live reconstruction made no volume; the reason is in {log_file}. The scan is not affected."
         )
     shown = _Shown(command, config.recon.seed, config.recon.method, started)
     _compare(result.path, folder / RECON, truth, shown, outside, clock)

@@ -168,12 +168,13 @@ def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator
         sentence = f"{which} {first_reason} `beamline recon` does not use frames that cannot be read."
         yield Finding("warning", "unreadable", f"{sentence} `validate --deep` reads all frames.")
     if source.damaged:
+        damaged_frames = spans(sorted(source.damaged))
         yield Finding(
             "error",
             "checksums",
             f"{len(source.damaged)} of {n} frames are damaged, because they differ from their stored checksums: "
-            f"{spans(sorted(source.damaged))}. Look for an intact copy of the file; `beamline recon` leaves "
-            "these frames out." + ("" if progress else " `validate --deep` compares all frames."),
+            f"{damaged_frames}. Look for an intact copy of the file; `beamline recon` leaves these frames out."
+            + ("" if progress else " `validate --deep` compares all frames."),
         )
     elif progress and not source.checksummed:
         yield Finding(
@@ -326,11 +327,13 @@ def time_order(source: ScanSource) -> Iterator[Finding]:
     """Frames are in the order of their times."""
     if source.table.times is not None and (back := np.flatnonzero(np.diff(source.table.times) < 0)).size:
         step = np.diff(source.table.times)[back[0]]
+        first_frame = back[0] + 1
+        seconds_back = -step
         yield Finding(
             "error",
             "time-order",
-            f"{back.size} frames have an earlier time than the frame before them (first: frame {back[0] + 1}, by "
-            f"{-step:.6g} s).",
+            f"{back.size} frames have an earlier time than the frame before them (first: frame {first_frame}, by "
+            f"{seconds_back:.6g} s).",
         )
 
 
@@ -356,19 +359,23 @@ def framestamp_order(source: ScanSource) -> Iterator[Finding]:
     repeated = np.flatnonzero(same_block & (steps <= 0))
     if repeated.size:
         first = repeated[0]
+        frame_number = first + 1
+        its_stamp = stamps[first + 1]
+        stamp_before = stamps[first]
         yield Finding(
             "error",
             "framestamps",
-            f"{repeated.size} frames have a framestamp that repeats or goes back (first: frame {first + 1}, framestamp "
-            f"{stamps[first + 1]} after {stamps[first]}).",
+            f"{repeated.size} frames have a framestamp that repeats or goes back (first: frame {frame_number}, "
+            f"framestamp {its_stamp} after {stamp_before}).",
         )
     skipped = [i for i in np.flatnonzero(same_block & (steps > 1)).tolist() if not _taken_again(source, i, steps[i])]
     if skipped:
+        n_missing = sum(steps[skipped] - 1)
+        next_frame = skipped[0] + 1
         yield Finding(
             "warning",
             "framestamps",
-            f"The camera recorded {sum(steps[skipped] - 1)} frames that are not in the file (first gap before frame "
-            f"{skipped[0] + 1}).",
+            f"The camera recorded {n_missing} frames that are not in the file (first gap before frame {next_frame}).",
         )
 
 

@@ -126,9 +126,10 @@ def raise_unless_complete(outcomes: Sequence[ScanOutcome]) -> None:
         others = ", ".join(f"{outcome.name} {outcome.status}" for outcome in bad)
         raise QueueError(f"{whole} of {len(outcomes)} scans are complete: {others}.", code)
     if alarmed:
-        raise AlarmError(
-            f"All scans are complete, but {alarmed[0].name}: {alarmed[0].why} Details are in {alarmed[0].path}."
-        )
+        scan_name = alarmed[0].name
+        fault = alarmed[0].why
+        folder = alarmed[0].path
+        raise AlarmError(f"All scans are complete, but {scan_name}: {fault} Details are in {folder}.")
 
 
 def take_all(request: ScanRequest) -> None:
@@ -174,7 +175,8 @@ def _take_next(
 ) -> Taken:
     """Run the n-th of the scans of a queue."""
     if request.wait and n:
-        ask_operator(f"Scan {n + 1} of {n_scans}: put the sample {config.sample.name} in place.")
+        number = n + 1
+        ask_operator(f"Scan {number} of {n_scans}: put the sample {config.sample.name} in place.")
     click.echo(f"Scan {n + 1} of {n_scans}: {config.sample.name}", err=True)
     sinks: list[Sink] = [json_sink, run]
     if config.series:

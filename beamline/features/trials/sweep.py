@@ -192,7 +192,8 @@ class SweptScan(TrialScan):
             DataError: no slice was made, or the held-out projections show no sample.
         """
         if not table.compared:
-            raise DataError(f"No slice was made. Reason for the first one: {table.outcomes[0].message}.")
+            reason = table.outcomes[0].message
+            raise DataError(f"No slice was made. Reason for the first one: {reason}.")
         direct = not self._trials[0].options.method.fitted
         if (scores := scores_of(self.unseen, direct=direct)) is None:
             outcomes = [replace(outcome, metrics={}) for outcome in table.outcomes]
@@ -218,7 +219,8 @@ class SweptScan(TrialScan):
         for name in best if same_views else ():
             tried = list(dict.fromkeys(trial.settings[name] for trial in self._trials))
             if len(tried) > 2 and best[name] in (tried[0], tried[-1]) and all(_NUMBER.fullmatch(str(v)) for v in tried):
-                notes.append(f"The best {name} is at the end of the range, {best[name]}: try values beyond it.")
+                best_value = best[name]
+                notes.append(f"The best {name} is at the end of the range, {best_value}: try values beyond it.")
         return replace(table, notes=notes)
 
 

@@ -72,7 +72,7 @@ def swept_option(text: str, legal: Collection[str]) -> SweptOption:
         )
     tried = _values(name, values)
     if len(tried) < 2:
-        advice = f". For a single value use `beamline recon --{name} {tried[0]}`" if tried else ""
+        advice = "".join(f". For a single value use `beamline recon --{name} {value}`" for value in tried)
         raise ValueError(
             f"a sweep needs at least two values, as NAME=A:B:STEP or NAME=a,b,c, but {text!r} has {len(tried)}{advice}"
         )
@@ -91,7 +91,8 @@ def _values(name: str, text: str) -> tuple[str, ...]:
         )
     steps = int((last - first) / step)
     if steps >= MOST:
-        raise ValueError(f"{name}={text} has {steps + 1} values, but at most {MOST} are possible: use a larger STEP")
+        n_values = steps + 1
+        raise ValueError(f"{name}={text} has {n_values} values, but at most {MOST} are possible: use a larger STEP")
     return tuple(f"{first + n * step:f}" for n in range(steps + 1))
 
 
@@ -102,9 +103,8 @@ def combinations(options: Sequence[SweptOption]) -> list[Mapping[str, str]]:
     """
     names = [option.name for option in options]
     if not 1 <= len(names) <= 2 or len(set(names)) < len(names):
-        raise ValueError(
-            f"{len(names)} options are given ({', '.join(names) or 'none'}); expected one or two different ones"
-        )
+        given_options = ", ".join(names) or "none"
+        raise ValueError(f"{len(names)} options are given ({given_options}); expected one or two different ones")
     combined: list[Mapping[str, str]] = [
         dict(zip(names, values, strict=True)) for values in itertools.product(*(option.values for option in options))
     ]
@@ -156,8 +156,9 @@ def sweep(words: tuple[str, ...], output: Path | None, as_json: bool) -> None:
     table = compare(plan, file, folder, as_json=as_json)
     if not as_json and table.best is not None:
         again = [word for name, value in table.best.items() for word in _as_words(name, str(value))]
+        recon_command = shlex.join(["beamline", "recon", *common, *again])
         click.echo(
-            f"If the pictures confirm the best value, use: {shlex.join(['beamline', 'recon', *common, *again])}",
+            f"If the pictures confirm the best value, use: {recon_command}",
             err=True,
         )
 
@@ -212,7 +213,8 @@ def _trials(options: Sequence[SweptOption], common: Sequence[str]) -> Trials:
     ]
     if all(each == settings[0] for each in settings[1:]):
         names = " and ".join(option.name for option in options)
-        raise click.UsageError(f"{names} changes nothing in a slice made with {trials[0][1].method.name}.")
+        method_name = trials[0][1].method.name
+        raise click.UsageError(f"{names} changes nothing in a slice made with {method_name}.")
     return trials
 
 
@@ -221,6 +223,7 @@ def _options(context: click.Context) -> ReconOptions:
     from beamline.reconstruct.options import OutputPaths
 
     if foreign := sorted(names_given(context) & _OF_A_VOLUME):
-        raise click.UsageError(f"--{foreign[0]} works only with whole volumes, but a sweep makes slices: leave it out.")
+        option = foreign[0]
+        raise click.UsageError(f"--{option} works only with whole volumes, but a sweep makes slices: leave it out.")
     target = OutputPaths(Path(gettempdir()) / "slice.h5", None, replace=True, written=False)
     return replace(options_of(context, BASELINE), target=target)

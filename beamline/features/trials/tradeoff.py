@@ -65,9 +65,10 @@ def planned_study(
         scan={**table.scan, "views to choose from": str(n_views)},
     )
     if not table.todo:
+        last_reason = choices[-1].reason
         raise DataError(
             f"{scan.source.path}: {n_views} projections are too few for any row of {study.name} (reason for the last "
-            f"one: {choices[-1].reason}). Use a scan with more projections."
+            f"one: {last_reason}). Use a scan with more projections."
         )
     warn = Warnings(sink, clock)
     for choice in choices:

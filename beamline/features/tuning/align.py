@@ -157,9 +157,10 @@ def align(
     first = float(plan.angles[0]) if angle is None else angle
     pair = [first, first + math.pi if first + math.pi <= limits.high else first - math.pi]
     if not all(limits.low - _ROUNDING <= each <= limits.high + _ROUNDING for each in pair):
+        two_angles = " and ".join(map(degrees, pair))
         raise ConfigError(
-            f"The projections would be at {' and '.join(map(degrees, pair))}, but the stage can only go from "
-            f"{degrees(limits.low)} to {degrees(limits.high)}. Choose another --angle. Nothing was started."
+            f"The projections would be at {two_angles}, but the stage can only go from {degrees(limits.low)} to "
+            f"{degrees(limits.high)}. Choose another --angle. Nothing was started."
         )
     frames, _ = take(_blocks(plan.exposure, pair), config, instrument, stop, sink)
     return evaluate(frames, config.optics.pixel_size_um * 1e-3 * config.devices.camera.binning)

@@ -140,10 +140,11 @@ class BandsCheck(Logged):
 
     def _flag(self, view: int, score: float, limit: float, region: PixelBox, word: str) -> Flag:
         first, after = region[:2] if word == "rows" else region[2:]
+        last = after - 1
+        darker_or_brighter = "darker" if score > 0 else "brighter"
         advice = (
-            f"Check the link and the readout of the camera, and the slits: {word} {first} ... {after - 1} suddenly "
-            f"became up to {abs(score):.0%} {'darker' if score > 0 else 'brighter'}, the rest of the frame did not. "
-            f"{AGAIN}"
+            f"Check the link and the readout of the camera, and the slits: {word} {first} ... {last} suddenly became "
+            f"up to {abs(score):.0%} {darker_or_brighter}, the rest of the frame did not. {AGAIN}"
         )
         return Flag(self.name, Level.ALARM, view, score, limit, advice, region)
 

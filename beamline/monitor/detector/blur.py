@@ -114,10 +114,10 @@ class BlurCheck(Logged):
         after = replace(state, kind=frame.kind, blurred=state.blurred + 1)
         worst = int(np.argmax(np.where(over, losses, -np.inf)))
         where = "" if all(over) else (" along the rows", " along the columns")[worst]
+        worst_loss = losses[worst]
         advice = (
-            f"Check focus and vibration: fine details have {losses[worst]:.0%} less contrast{where} than in the "
-            "projections "
-            "before. The focus moved, or the sample moved during the exposure. " + again_by(self.name)
+            f"Check focus and vibration: fine details have {worst_loss:.0%} less contrast{where} than in the "
+            "projections before. The focus moved, or the sample moved during the exposure. " + again_by(self.name)
         )
         return CheckResult(after, Flag(self.name, Level.WARN, frame.index, losses[worst], limits[worst], advice))
 

@@ -179,10 +179,13 @@ def poses_of(scan: SelectedScan, frames: I64) -> ScanPoses | None:
     # the displacement of offset projections is at most a few fields of view
     if (far := (np.abs(shifts) >= (8 * width, height)).any(axis=1)).any():
         row = int(np.flatnonzero(far)[0])
+        projection = table.keys[row]
+        shift_cols = shifts[row, 0]
+        shift_rows = shifts[row, 1]
         raise DataError(
-            f"{table.path}: {table.by} {table.keys[row]:g} is displaced by {shifts[row, 0]:g} columns and "
-            f"{shifts[row, 1]:g} rows, but the detector has {width} x {height} pixels. Expected "
-            "displacements in pixels of the unbinned detector."
+            f"{table.path}: {table.by} {projection:g} is displaced by {shift_cols:g} columns and {shift_rows:g} "
+            f"rows, but the detector has {width} x {height} pixels. Expected displacements in pixels of the unbinned "
+            "detector."
         )
     n = len(source.table)
     every = np.full((n, 4), np.nan)
@@ -213,9 +216,10 @@ def _of_vectors(table: PoseTable, scan: SelectedScan) -> Geometry:
     size = selection.pixel_size_mm
     if size is None or abs(size - views.pixel_pitch) > _SAME_SIZE * size:
         stated = "does not state its pixel size" if size is None else f"has pixels of {1e3 * size:.6g} um"
+        pitch_um = 1e3 * views.pixel_pitch
         raise ConfigError(
-            f"{table.path} has vectors for pixels of {1e3 * views.pixel_pitch:.6g} um, but {source.path} "
-            f"{stated}; expected the same size. Give --pixel-size-um, or vectors in mm."
+            f"{table.path} has vectors for pixels of {pitch_um:.6g} um, but {source.path} {stated}; expected the "
+            "same size. Give --pixel-size-um, or vectors in mm."
         )
     rows = selection.detector_rows
     return views.rows(rows.start, rows.stop).binned(selection.binning)
@@ -263,9 +267,10 @@ def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
     else:
         into = views if table.by == "view" else np.arange(n)
         if (beyond := table.keys >= into.size).any():
+            number = table.keys[beyond][0]
             raise DataError(
-                f"{table.path} states {table.by} {table.keys[beyond][0]:g}, but {source.path} has "
-                f"{into.size} {table.by}s, counted from 0."
+                f"{table.path} states {table.by} {number:g}, but {source.path} has {into.size} {table.by}s, counted "
+                "from 0."
             )
         row_of_frame[into[table.keys.astype(np.int64)]] = np.arange(table.keys.size)
         if table.angles_deg is not None:
@@ -274,9 +279,10 @@ def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
             if (off > tolerance).any():
                 frame = int(both[off > tolerance][0])
                 stated = table.angles_deg[row_of_frame[frame]]
+                scan_degrees = degrees[frame]
                 raise DataError(
                     f"{table.path} states frame {frame} at {stated:.6g} degrees, but {source.path} at "
-                    f"{degrees[frame]:.6g}; expected the poses of the same scan."
+                    f"{scan_degrees:.6g}; expected the poses of the same scan."
                 )
     return row_of_frame
 
@@ -286,10 +292,11 @@ def require_stated(poses: ScanPoses, source: ScanSource, view_ids: I64) -> None:
     unknown, table = view_ids[~poses.stated(view_ids)], poses.table
     if unknown.size:
         degrees = np.degrees(source.table.angles[unknown[0]])
+        first_unknown = unknown[0]
         raise DataError(
             f"{table.path} has no pose for {unknown.size} of the {view_ids.size} projections chosen from "
-            f"{source.path} (the first: frame {unknown[0]}, at {degrees:.6g} degrees). Add the missing poses, or use "
-            "--views to choose only projections that have a pose."
+            f"{source.path} (the first: frame {first_unknown}, at {degrees:.6g} degrees). Add the missing poses, or "
+            "use --views to choose only projections that have a pose."
         )
 
 

@@ -189,7 +189,8 @@ def with_tilt(
             f"{math.degrees(tilt):.1f} degrees, and at most {math.degrees(STEEPEST):g} are searched. Give "
             "the tilt with --tilt DEGREES."
         )
-    lean = f"The axis is tilted by {tilt_text(tilt, uncertainty)}, {abs(tilt) * rows:.2g} px over {rows} rows"
+    offset_px = abs(tilt) * rows
+    lean = f"The axis is tilted by {tilt_text(tilt, uncertainty)}, {offset_px:.2g} px over {rows} rows"
     if uncertainty * rows > MATTERS:
         warn(
             "Check the first and the last slices for double edges, because the tilt is not known to half a "

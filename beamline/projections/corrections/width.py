@@ -141,9 +141,10 @@ class Width:
                         if geometry.is_cone
                         else "the projections are rolled or tilted, or will be calibrated for roll or tilt"
                     )
+                    exposure_arc = self.arc.split(":")[0]
                     raise ConfigError(
-                        f"Use --exposure-arc {self.arc.split(':')[0]} instead of {self.arc}: the readout arc (after "
-                        f"the colon) needs a parallel beam without roll or tilt, but {found}. Nothing was written."
+                        f"Use --exposure-arc {exposure_arc} instead of {self.arc}: the readout arc (after the colon) "
+                        f"needs a parallel beam without roll or tilt, but {found}. Nothing was written."
                     )
             elif abs(stated.arc) * reach >= _LEAST_PX:
                 motion = _Motion(stated.arc, 0.0 if bent else stated.skew)
@@ -158,16 +159,17 @@ class Width:
         exposed_geometry = exposed_geometry.seen_with(
             replace(width, arc=abs(motion.arc)), motion.skew * selection.binning
         )
-        turned = math.degrees(abs(motion.arc)), math.degrees(motion.skew * (rows - 1))
+        exposure_degrees, readout_degrees = math.degrees(abs(motion.arc)), math.degrees(motion.skew * (rows - 1))
+        edge_px = abs(motion.arc) * reach
         statements = [
             *([f"each ray has the area of a pixel{f' and a blur of {blur:g} px' if blur else ''}"] if width else []),
-            *([f"a projection is the mean over {turned[0]:.3g} degrees ({abs(motion.arc) * reach:.2g} px at "
-                "the edge of the field of view)"] if motion.arc else []),
-            *([f"the last detector row is exposed {turned[1]:.2g} degrees later than the first"]
+            *([f"a projection is the mean over {exposure_degrees:.3g} degrees ({edge_px:.2g} px at the edge of the "
+               "field of view)"] if motion.arc else []),
+            *([f"the last detector row is exposed {readout_degrees:.2g} degrees later than the first"]
               if motion.skew else []),
         ]  # fmt: skip
         parameters |= {
-            "ray_width": self.spread, "exposure_arc_deg": math.degrees(motion.arc), "readout_arc_deg": turned[1],
+            "ray_width": self.spread, "exposure_arc_deg": math.degrees(motion.arc), "readout_arc_deg": readout_degrees,
         }  # fmt: skip
         return exposed_geometry, StepDone(f"Ray width in the reconstruction: {', '.join(statements)}.", parameters)
 

@@ -198,14 +198,14 @@ def _in_equal_steps(angles: NDArray[np.float64]) -> bool:
 def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: NDArray[np.int64] | None) -> str:
     n, frames = source.table.views.size, len(source.table)
     if frames == 1 < angles.size:
+        n_rows, n_cols = source.shape
         return (
-            f"{name} has {angles.size} angles, but {source.path} is one image of {source.shape[0]} x "
-            f"{source.shape[1]} pixels. If the image is a sinogram, its rows or its columns are the projections: "
-            "give one angle for each row or each column, or use --angle-rows A:B to choose the angles of this image "
-            "(lines A to B - 1, counted from 0)."
+            f"{name} has {angles.size} angles, but {source.path} is one image of {n_rows} x {n_cols} pixels. If the "
+            "image is a sinogram, its rows or its columns are the projections: give one angle for each row or each "
+            "column, or use --angle-rows A:B to choose the angles of this image (lines A to B - 1, counted from 0)."
         )
     if angles.size < n:
-        message = f"{name} has {angles.size} angles for {n} projections, so {n - angles.size} projections have no angle"
+        message = f"{name} has only {angles.size} angles for {n} projections"
     elif angles.size == frames:
         message = (
             f"{name} has {angles.size} angles, one for each frame, but {source.path} does not state when "
@@ -213,10 +213,10 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
         )
     else:
         message = f"{name} has {angles.size} angles, but {n} of the {frames} frames are projections"
-    if others := [field.value for field in source.not_used if field.where == OTHER_FILES]:
+    for n_images in [field.value for field in source.not_used if field.where == OTHER_FILES][:1]:
         message += (
-            f". According to its OME metadata, {source.path} is one file of a set, and the others contain "
-            f"{others[0]} images: add them with --append FILE"
+            f". According to its OME metadata, {source.path} is one file of a set, and the others contain {n_images} "
+            "images: add them with --append FILE"
         )
     if series is not None and (gaps := source.attributes.get("missing_numbers")):
         message += (
@@ -238,11 +238,11 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
     sinograms, window = "", evenly_spaced_window(angles, n)
     if angles.size in source.shape:
         order = ("row,view,col", "row,col,view")[source.shape.index(angles.size)]
-        sinograms = f"If each image is a sinogram of {angles.size} projections, give --order {order}. If not, use"
+        sinograms = f"If each image is a sinogram of {angles.size} projections, give --order {order}. Otherwise use"
         if not source.table.are_views.all():
             sinograms = (
                 f"If one image is a sinogram of {angles.size} projections, give it alone as FILE, and the "
-                "others with --darks and --flats. If not, use"
+                "others with --darks and --flats. Otherwise use"
             )
     message += (
         f". {sinograms or 'Use'} --angle-rows A:B to choose the {n} angles of the projections (lines A to B - 1, "
@@ -251,9 +251,10 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
     if window is None:
         return f"{message}."
     low, high = np.degrees(angles[list(window)])
+    lines = f"{window[0]}:{window[1] + 1}"
     return (
-        f"{message}. --angle-rows {window[0]}:{window[1] + 1} uses the {n} consecutive angles with the "
-        f"most equal steps, from {low:.4f} to {high:.4f} degrees."
+        f"{message}. --angle-rows {lines} uses the {n} consecutive angles with the most equal steps, from "
+        f"{low:.4f} to {high:.4f} degrees."
     )
 
 

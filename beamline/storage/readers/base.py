@@ -197,7 +197,8 @@ def frame_indices(frames: slice | ArrayLike, n: int) -> NDArray[np.int64]:
         raise IndexError(f"Frames are chosen by a slice or by integers, but {indices.dtype} {indices.shape} was given.")
     indices = indices.astype(np.int64)
     if indices.min() < -n or indices.max() >= n:
-        raise IndexError(f"Frames {indices.min()}..{indices.max()} were requested, but only 0..{n - 1} can be read.")
+        last = n - 1
+        raise IndexError(f"Frames {indices.min()}..{indices.max()} were requested, but only 0..{last} can be read.")
     return np.where(indices < 0, indices + n, indices)
 
 

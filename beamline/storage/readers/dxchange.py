@@ -110,7 +110,8 @@ class ExchangeSource(StacksSource):
         return "exchange/data", "".join(f" --{name}s-path exchange/{where}" for name, where in _OTHERS)
 
     def exchange_sinogram(self, *, views_first: bool) -> str:
-        return f"set the attribute axes of /exchange/data to {'x:theta' if views_first else 'theta:x'}"
+        right_axes = "x:theta" if views_first else "theta:x"
+        return f"set the attribute axes of /exchange/data to {right_axes}"
 
     def refresh(self) -> int:
         if not self.grows:
@@ -285,9 +286,10 @@ def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.
     angles = datasets.radians(theta, default="degrees")
     if all_there and (angles.size != n_views or n_views not in (1, *theta.shape)):
         way = f" If the scan ended early, use the first angles: --angles-path /exchange/theta --angle-rows 0:{n_views}"
+        remedy = way if angles.size > n_views else ""
         raise DataError(
             f"{file.filename}: /exchange/theta has {angles.size} angles for {n_views} projections, shape "
-            f"{theta.shape}; expected one angle for each.{way if angles.size > n_views else ''}"
+            f"{theta.shape}; expected one angle for each.{remedy}"
         )
     return angles
 

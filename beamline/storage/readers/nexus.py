@@ -67,9 +67,10 @@ def find(file: h5py.File) -> list[Places]:
                 if key is not None and data is not None and data.ndim == 3:
                     places.append(Places(entry, detector, data, key, *_find_angle(entry, detector, len(data))))
     if unresolved and not places:
+        reason = unresolved[0]
         raise DataError(
-            f"{file.filename} has no frames: {unresolved[0]}. Put the file to which the link points back "
-            "into the folder of this file."
+            f"{file.filename} has no frames: {reason}. Put the file to which the link points back into the folder of "
+            "this file."
         )
     return places
 
@@ -107,7 +108,8 @@ def _find_angle(entry: h5py.Group, detector: h5py.Group, n: int) -> tuple[h5py.D
     lists = [item for item in datasets.arrays_in(entry.file, (1,)) if item.size == n]
     units = ((item, datasets.factor_of(datasets.attribute(item, "units"), datasets.ANGLE_UNITS)) for item in lists)
     names = [str(item.name) for item, known in units if known is not None]
-    which = f"; {', '.join(names[:_LISTED])} may be the angles: --angles-path {names[0]} uses them" if names else ""
+    candidates = ", ".join(names[:_LISTED])
+    which = f"; {candidates} may be the angles: --angles-path {names[0]} uses them" if names else ""
     return None, f"{entry.name} has no sample/rotation_angle{which}", 1
 
 
@@ -157,9 +159,10 @@ def choose(file: h5py.File, detectors: list[Places], data: str | None = None) ->
     names = ", ".join(
         f"{places.data.name} ({' x '.join(map(str, places.data.shape))})" for places in detectors[:_LISTED]
     )
+    first_data = detectors[0].data.name
     raise DataError(
-        f"{file.filename} has several detectors with frames, and no attribute `default` names one of "
-        f"them: {names}. Choose one: --data-path {detectors[0].data.name}."
+        f"{file.filename} has several detectors with frames, and no attribute `default` names one of them: {names}. "
+        f"Choose one: --data-path {first_data}."
     )
 
 
@@ -262,7 +265,8 @@ def _cone_of(
         if diverged is None
         else f", and rays deviate from parallel ones by {diverged:.2g} px within the field of view"
     )
-    return None, {"source_distance": f"{sod:g} mm, treated as a parallel beam (magnification {sdd / sod:.4f}{by})"}
+    magnified = sdd / sod
+    return None, {"source_distance": f"{sod:g} mm, treated as a parallel beam (magnification {magnified:.4f}{by})"}
 
 
 def differing(height: float | None, width: float | None) -> float | None:
@@ -280,10 +284,11 @@ def require_order(places: Places) -> None:
             datasets.text(axis) for part in np.ravel(nxdata.attrs["axes"]) for axis in datasets.text(part).split(":")
         ]
         if order_of_axes(axes) not in (None, (0, 1, 2)):
+            stated_axes = ", ".join(axes)
             raise DataError(
-                f"{nxdata.name} in {places.entry.file.filename} states the axes {', '.join(axes)}; "
-                "expected frames [frame, row, col]: the rotation angle, then y, then x. Reorder the "
-                "frames in a copy of the file, or correct the attribute `axes`."
+                f"{nxdata.name} in {places.entry.file.filename} states the axes {stated_axes}; expected frames "
+                "[frame, row, col]: the rotation angle, then y, then x. Reorder the frames in a copy of the file, "
+                "or correct the attribute `axes`."
             )
 
 

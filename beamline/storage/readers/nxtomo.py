@@ -100,9 +100,10 @@ class NexusSource(ScanSource):
         require_order(self._places)
         lost = datasets.missing_links(self._places.data) + datasets.missing_links(self._places.keys)
         if lost:
+            linked_file = lost[0]
             raise DataError(
-                f"{self.path} refers to frames in {lost[0]}, which does not exist or has another shape ({len(lost)} "
-                "such links)."
+                f"{self.path} refers to frames in {linked_file}, which does not exist or has another shape "
+                f"({len(lost)} such links)."
             )
 
     @property
@@ -120,8 +121,11 @@ class NexusSource(ScanSource):
         kinds = kinds_of(np.ravel(datasets.values_of(keys)))
         sizes = (int(places.data.shape[0]), kinds.size, angles.size)
         if min(sizes) < n or (ended and max(sizes) > n):
+            n_frames = sizes[0]
+            n_keys = sizes[1]
+            n_angles = sizes[2]
             raise DataError(
-                f"{self.path}: {sizes[0]} frames, {sizes[1]} image keys and {sizes[2]} angles; expected {n} of each."
+                f"{self.path}: {n_frames} frames, {n_keys} image keys and {n_angles} angles; expected {n} of each."
             )
         self.n = n
         seconds, times = self._seconds(places.detector, "count_time"), self._seconds(places.entry, "frame_log/time")

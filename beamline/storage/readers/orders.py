@@ -170,10 +170,12 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
     order = order or ("col,view" if max(sizes[: fits[0]]) > 1 else "view,col")
     images = as_frames(_ImageStack(base), places := stated_order(order))
     if not isinstance(images, TurnedFrames) or not alike:
+        n_rows = base.shape[0]
+        n_cols = base.shape[1]
         raise DataError(
-            f"--order {order} does not fit {base.path}, {len(base.table)} images of {base.shape[0]} x "
-            f"{base.shape[1]} pixels. --order must name each dimension, and all images must show the sample: give "
-            "darks and flats with --darks and --flats."
+            f"--order {order} does not fit {base.path}, {len(base.table)} images of {n_rows} x {n_cols} pixels. "
+            "--order must name each dimension, and all images must show the sample: give darks and flats with "
+            "--darks and --flats."
         )
 
     def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:

@@ -199,8 +199,9 @@ def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
 
 def _read(path: Path, item: Any) -> NDArray[Any]:
     if lost := datasets.missing_links(item):
+        linked_file = lost[0]
         raise DataError(
-            f"{path} refers to data of {item.name} in {lost[0]}, which does not exist or has another shape."
+            f"{path} refers to data of {item.name} in {linked_file}, which does not exist or has another shape."
         )
     frames = as_frames(item)
     if frames.ndim != 3:

@@ -272,7 +272,8 @@ def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFi
         raise DataError(f"{path} states {other}: only scans on a circle are supported.")
     sod, sdd, pixel, count = (number[name] or 0.0 for name in _NEEDED)
     if lacking := [getattr(keys, name) for name in _NEEDED if not 0 < (number[name] or 0) < _LARGEST]:
-        raise DataError(f"{path} states no {', '.join(lacking)}; expected positive numbers below {_LARGEST:g}.")
+        missing_values = ", ".join(lacking)
+        raise DataError(f"{path} states no {missing_values}; expected positive numbers below {_LARGEST:g}.")
     pixel *= keys.unit * (sdd / sod if keys.at_sample else 1.0)
     n, scale = int(count), number["scale"] or 1.0
     angles = _degrees(path, keys, number, n)

@@ -111,8 +111,9 @@ class StacksSource(ScanSource):
             if isinstance(item, h5py.Dataset | NamedArray):
                 self.unpack_bytes = max(self.unpack_bytes, datasets.require_possible(stack.frames))
                 if lost := datasets.missing_links(item):
+                    linked_file = lost[0]
                     raise DataError(
-                        f"{self.path} refers to frames in {lost[0]}, which does not exist or has another shape."
+                        f"{self.path} refers to frames in {linked_file}, which does not exist or has another shape."
                     )
         if not len(views.frames):
             none = DataError if self.finished else hdf5.NotReadyError

@@ -205,7 +205,8 @@ def require_possible(tif: tifffile.TiffFile, most: float = math.inf) -> None:
     first, stored = tif.pages.first, tif.filehandle.size
     claimed = first.nbytes * len(tif.pages)
     if not first.nbytes or claimed > min(most, PACKED * stored) or is_blank(claimed, stored, first.nbytes):
-        raise ValueError(f"the header states {claimed / 1e9:.3g} GB, but the file has {stored} bytes")
+        claimed_gb = claimed / 1e9
+        raise ValueError(f"the header states {claimed_gb:.3g} GB, but the file has {stored} bytes")
 
 
 def refuse_packed(tif: tifffile.TiffFile) -> None:

@@ -50,7 +50,8 @@ def cropped(base: ScanSource, cols: tuple[int, int]) -> ScanSource:
     """
     first, end = cols
     if not 0 <= first < end <= base.shape[1]:
-        raise ConfigError(f"--cols {first}:{end} is out of range: the detector has columns 0:{base.shape[1]}.")
+        n_cols = base.shape[1]
+        raise ConfigError(f"--cols {first}:{end} is out of range: the detector has columns 0:{n_cols}.")
 
     def moved(table: FrameTable) -> FrameTable:
         if (flags := table.flags) is None:

@@ -31,11 +31,14 @@ def angles_unknown(scan: ScanEvidence) -> str:
     why = f"; {why}" if (why := scan.source.attributes.get("angles")) else ""
     runs = np.split(unknown, np.flatnonzero(np.diff(unknown) > 1) + 1)
     listed = "+".join(f"{run[0]}:{run[-1] + 1}" for run in runs[:_LISTED] if run.size) + "+..." * (len(runs) > _LISTED)
-    return "" if not unknown.size else (
-        f"{unknown.size} of {views.size} projections have no angle (first: frame {unknown[0]}){why}. Give "
-            "the angles with --angles FILE (degrees, one per "
-            f"line){f', or leave these projections out: --frames none={listed}' * (unknown.size < views.size)}."
-    )  # fmt: skip
+    if not unknown.size:
+        return ""
+    first_frame = unknown[0]
+    return (
+        f"{unknown.size} of {views.size} projections have no angle (first: frame {first_frame}){why}. Give the "
+        "angles with --angles FILE (degrees, one per "
+        f"line){f', or leave these projections out: --frames none={listed}' * (unknown.size < views.size)}."
+    )
 
 
 def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
@@ -57,8 +60,9 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
     span = float(np.ptp(degrees))
     distinct = np.unique(np.round(degrees, 6))
     if distinct.size == 1:
+        only_angle = distinct[0]
         yield Finding(
-            "error", "angle-spread", f"All {angles.size} projections have the same angle, {distinct[0]:g} degrees."
+            "error", "angle-spread", f"All {angles.size} projections have the same angle, {only_angle:g} degrees."
         )
         return
     step = span / (distinct.size - 1)
@@ -74,13 +78,14 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
             "projection." + (_COUNTED if not scan.source.plan and np.allclose(degrees, np.arange(angles.size)) else ""),
         )
     elif scan.cone is None and (n := directions(angles)) <= min((distinct.size + 1) / 2, scan.source.shape[1] / _FEW):
+        n_cols = scan.source.shape[1]
         yield Finding(
             "warning",
             "angle-spread",
-            f"Compare with --method fista-tv, because FBP leaves streaks: the {distinct.size} projections "
-            f"show only {n} directions, which is few for {scan.source.shape[1]} columns. With steps of "
-            f"{step:.4g} degrees many projections are 180 degrees apart, and these measure the same rays. "
-            "Next time, use a step that does not divide 180 degrees.",
+            f"Compare with --method fista-tv, because FBP leaves streaks: the {distinct.size} projections show only "
+            f"{n} directions, which is few for {n_cols} columns. With steps of {step:.4g} degrees many projections "
+            "are 180 degrees apart, and these measure the same rays. Next time, use a step that does not divide 180 "
+            "degrees.",
         )
 
 
@@ -131,14 +136,18 @@ def _no_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64]) -> s
     """
     between = float(np.median(np.abs(np.diff(np.degrees(angles)))))
     if look_like_degrees(angles):
+        n_turns = np.ptp(distinct) / 360
+        span_rad = np.ptp(angles)
         return (
-            f"The stated angles of {angles.size} projections span {np.ptp(distinct) / 360:.1f} turns "
-            f"({np.ptp(angles):.5g} rad). These angles look like degrees that are labelled as radians. In that case "
-            "give the angles with --angles FILE (degrees, one per line)."
+            f"The stated angles of {angles.size} projections span {n_turns:.1f} turns ({span_rad:.5g} rad). These "
+            "angles look like degrees that are labelled as radians. In that case give the angles with --angles FILE "
+            "(degrees, one per line)."
         )
     if between >= 360:
+        first_angle = distinct[0]
+        last_angle = distinct[-1]
         return (
-            f"The projections go from {distinct[0]:.6g} to {distinct[-1]:.6g} degrees in steps of {between:.4g}, a "
+            f"The projections go from {first_angle:.6g} to {last_angle:.6g} degrees in steps of {between:.4g}, a "
             "whole turn or more. These values look like counts of an encoder or of motor steps. Give the angles in "
             "degrees with --angles FILE (one per line). If the values are degrees, subtract whole turns."
         )

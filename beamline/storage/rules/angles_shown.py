@@ -176,14 +176,19 @@ def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
         first_of_each = (
             f" Or use the first projection of each angle: --frames 0::{n}." if (lengths[:-1] == n).all() else ""
         )
+        one_frame = first[0]
+        other_frame = last[0]
+        start = degrees[0]
+        stated_degrees = seen.degrees[first[0]]
+        times = across / beside
         yield Finding(
             "warning",
             "angle-spread",
-            f"Each angle is stated for {n} frames, but frames of one angle differ: frames {first[0]} and {last[0]}, "
-            f"both stated at {seen.degrees[first[0]]:.6g} degrees, differ {across / beside:.2g} times as much as "
+            f"Each angle is stated for {n} frames, but frames of one angle differ: frames {one_frame} and "
+            f"{other_frame}, both stated at {stated_degrees:.6g} degrees, differ {times:.2g} times as much as "
             "neighbours do. The angles were read back more slowly than frames were taken, while the stage rotated. "
             f"Give the angle of each of the {degrees.size} projections with --angles FILE (degrees, one per line), "
-            f"from {degrees[0]:.6g} in even steps if the stage rotated evenly.{first_of_each}",
+            f"from {start:.6g} in even steps if the stage rotated evenly.{first_of_each}",
         )
 
 
@@ -269,7 +274,8 @@ def _angles_finding(scan: ScanEvidence, degrees: NDArray[np.float64], turn: _Tur
     if counted:
         unit = "the values are 0, 1, 2 and so on, so they are frame numbers"
     else:
-        unit = f"the angles look {180 / turn.degrees:.3g} times as large as stated"
+        times = 180 / turn.degrees
+        unit = f"the angles look {times:.3g} times as large as stated"
     pairs = (
         f"Frames {turn.alike[0]} and {turn.alike[1]} are mirror images, as projections 180 degrees apart "
         f"are, but they are stated {turn.degrees:.4g} degrees apart"

@@ -149,9 +149,10 @@ def frames_flagged(scan: ScanEvidence) -> Iterator[Finding]:
     treated = flag_policy(flags, scan.table.are_views, scan.source.shape)
     n, lost = int(treated.views.sum()), int(treated.left_out.sum())
     if lost and n - lost < FEWEST_VIEWS:
+        n_good = n - lost
         message += (
-            f" Repeat the scan: only {n - lost} of {n} projections have no alarm, and {FEWEST_VIEWS} are "
-            "needed. `beamline recon --flags ignore` uses all projections, also flagged ones."
+            f" Repeat the scan: only {n_good} of {n} projections have no alarm, and {FEWEST_VIEWS} are needed. "
+            "`beamline recon --flags ignore` uses all projections, also flagged ones."
         )
         yield Finding("error", FLAGS, message)
         return

@@ -121,11 +121,12 @@ def check_air_level(scan: ScanEvidence, level: float, air: bool, accepted: bool 
             else "this difference is not subtracted, because no air is known next to the sample"
         )
         factor = math.exp(abs(level))
+        dark_or_bright = "dark" if level > 0 else "bright"
         sentence = (
-            f"{where} is {factor:.3g} times as {'dark' if level > 0 else 'bright'} as the flats "
-            f"({level:+.2f} in line integral, {what}). During one scan a beam changes by a factor of up "
-            f"to {math.exp(WARN):.2g}, and a sample can only absorb. Were the projections, flats and "
-            f"darks taken with the same settings and stored in the same way? {_counts_in_words(scan)}"
+            f"{where} is {factor:.3g} times as {dark_or_bright} as the flats ({level:+.2f} in line integral, "
+            f"{what}). During one scan a beam changes by a factor of up to {math.exp(WARN):.2g}, and a sample can "
+            "only absorb. Were the projections, flats and darks taken with the same settings and stored in the same "
+            f"way? {_counts_in_words(scan)}"
         )
         refused = abs(level) > REFUSE
         if darker:
@@ -190,7 +191,9 @@ def _counts_in_words(scan: ScanEvidence) -> str:
     lit = lit_places(flat - dark)
     places = lit & (seen >= np.percentile(seen[lit], BRIGHT)) if lit.any() else np.ones_like(lit)
     counts = float(np.median(flat[places])), float(np.median(seen[places]))
-    there = f"Counts in these places: {counts[0]:.6g} in the flats, {counts[1]:.6g} in the projections."
+    flat_counts = counts[0]
+    view_counts = counts[1]
+    there = f"Counts in these places: {flat_counts:.6g} in the flats, {view_counts:.6g} in the projections."
     return f"{there} {_exposures_in_words(scan, flats, views)}"
 
 
@@ -216,12 +219,14 @@ def without_air(scan: ScanEvidence, mean: float) -> str:
     """
     flats, views = scan.table.flats, scan.table.views
     more = math.log1p(BRIGHTER_FLATS)
+    error = HIGHER * math.expm1(mean)
+    relative_error = more / mean
     return (
-        "Compare a density that you know: flats and darks cannot be checked, because no detector column "
-        f"shows air. If the flats are {BRIGHTER_FLATS:.0%} too bright, every line integral is {more:.3f} too "
-        f"large ({more / mean:.0%} of the mean), and densities are too large by up to the same fraction. "
-        f"If the darks are too high by {HIGHER:.0%} of the intensity, the mean line integral is about "
-        f"{HIGHER * math.expm1(mean):.2g} too large. {_exposures_in_words(scan, flats, views)}"
+        "Compare a density that you know: flats and darks cannot be checked, because no detector column shows air. "
+        f"If the flats are {BRIGHTER_FLATS:.0%} too bright, every line integral is {more:.3f} too large "
+        f"({relative_error:.0%} of the mean), and densities are too large by up to the same fraction. If the darks "
+        f"are too high by {HIGHER:.0%} of the intensity, the mean line integral is about {error:.2g} too large. "
+        f"{_exposures_in_words(scan, flats, views)}"
     )
 
 
@@ -274,12 +279,13 @@ def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
         views = scan.table.exposures[scan.table.views]
         known = bool((flats > 0).all())
         taken = scan.exposures[scan.table.flats]
+        assumed_exposure = np.nan_to_num(taken, nan=usual).max(initial=0.0)
         doubt = f"scaled to {usual:g} s" + (
             "."
             if known
-            else f". The exposure of the flats is not stated. {np.nan_to_num(taken, nan=usual).max():g} s is "
-            "assumed, because no projection is then brighter than the flats. If the sample fills the field of view, "
-            "this may be a wrong exposure. All line integrals are then wrong by the same amount."
+            else f". The exposure of the flats is not stated. {assumed_exposure:g} s is assumed, because no "
+            "projection is then brighter than the flats. If the sample fills the field of view, this may be a "
+            "wrong exposure. All line integrals are then wrong by the same amount."
         )
         yield Finding(
             "info" if known else "warning",
@@ -289,11 +295,12 @@ def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
         )
     darks = darks[darks > 0]
     if darks.size and np.ptp(darks) <= EXPOSURE_TOLERANCE * usual < np.abs(darks - usual).max():  # never true for NaN
+        dark_exposure = darks[0]
         yield Finding(
             "warning",
             "exposures",
-            f"Take darks with the exposure of the projections: the darks were exposed for {darks[0]:g} s "
-            f"and the projections for {usual:g} s, so hot pixels and dark current differ.",
+            f"Take darks with the exposure of the projections: the darks were exposed for {dark_exposure:g} s and "
+            f"the projections for {usual:g} s, so hot pixels and dark current differ.",
         )
 
 
@@ -322,10 +329,11 @@ def one_intensity(scan: ScanEvidence) -> Iterator[Finding]:
     if not (beside and n and n == lights_in_turn(levels[1]) and change >= most):
         return
     difference = np.expm1(change)
+    first_frame = views[0]
     yield Finding(
         "error" if lights_in_turn(_log_intensities(scan, flats[:_IN_A_ROW])) else "warning",
         "light",
-        f"The projections alternate between {n} intensities from frame to frame (from frame {views[0]} on; "
+        f"The projections alternate between {n} intensities from frame to frame (from frame {first_frame} on; "
         f"{difference:.0%} apart), because thresholds, exposures or energies alternate. A volume can use only one of "
         f"these intensities. {_way_of_steps(scan, n, most)}",
     )
@@ -367,7 +375,11 @@ def _share_of_flats(scan: ScanEvidence, step: slice, most: float) -> float:
 def several_energies(scan: ScanEvidence) -> str:
     """All projections were taken at one energy, as a volume requires. Otherwise the finding lists the energies."""
     energies = np.zeros(0) if scan.table.energies is None else scan.table.energies[scan.table.views]
-    return "" if len(parts := frames_by_energy(energies)) < 2 else (
+    parts = frames_by_energy(energies)
+    if len(parts) < 2:
+        return ""
+    first_energy = parts[0][0]
+    return (
         f"The projections were taken at {len(parts)} energies: {in_words(energies)}. A volume needs one energy. "
-        f"Choose an energy, for example with --frames energy={parts[0][0]:.6g}, which leaves out all other frames."
-    )  # fmt: skip
+        f"Choose an energy, for example with --frames energy={first_energy:.6g}, which leaves out all other frames."
+    )

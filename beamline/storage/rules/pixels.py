@@ -100,12 +100,14 @@ def pixels_measured(scan: ScanEvidence) -> Iterator[Finding]:
         message = f"The projections checked have no finite pixel: all are NaN, infinite or beyond {LARGEST:g}."
         yield Finding("error", "pixels", message)
     elif float(views[finite].min()) == float(views[finite].max()):
-        yield Finding("error", "pixels", f"Every pixel of the projections checked is {views[finite][0]:g}.")
+        value = views[finite][0]
+        yield Finding("error", "pixels", f"Every pixel of the projections checked is {value:g}.")
     elif not finite.all():
+        bad_share = 1 - finite.mean()
         yield Finding(
             "warning",
             "pixels",
-            f"{1 - finite.mean():.3%} of the pixels checked are NaN, infinite or beyond {LARGEST:g}.",
+            f"{bad_share:.3%} of the pixels checked are NaN, infinite or beyond {LARGEST:g}.",
         )
     if scan.source.quantity == "line_integrals" and _falls(scan):
         yield Finding(

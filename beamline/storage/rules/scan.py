@@ -69,17 +69,18 @@ def scan_ended(scan: ScanEvidence) -> Iterator[Finding]:
 def altered_sentence(source: ScanSource) -> str:
     """Sentences about the rows of a scan whose record differs from its checksum."""
     rows = np.flatnonzero(source.table.altered).tolist()
+    these_frames = "this frame" if len(rows) == 1 else "these frames"
     return (
-        f"Look for an intact copy of {source.path}: the records of {count(len(rows), 'frame')} (kind, "
-        f"angle, time, trigger) differ from the checksum stored with them: {spans(rows)}. No command uses "
-        f"{'this frame' if len(rows) == 1 else 'these frames'}."
+        f"Look for an intact copy of {source.path}: the records of {count(len(rows), 'frame')} (kind, angle, time, "
+        f"trigger) differ from the checksum stored with them: {spans(rows)}. No command uses {these_frames}."
     )
 
 
 def references_present(scan: ScanEvidence) -> Iterator[Finding]:
     """A scan whose pixels are counts has darks and flats."""
     if "beside" in scan.source.attributes:
-        sentence = f"The darks and flats next to the projections are used: {scan.source.attributes['beside']}."
+        where = scan.source.attributes["beside"]
+        sentence = f"The darks and flats next to the projections are used: {where}."
         yield Finding("info", "references", sentence)
     for name, kind in (("flats", FrameKind.FLAT), ("darks", FrameKind.DARK)):
         if scan.in_counts and not scan.table.of_kind(kind).size:
@@ -162,7 +163,8 @@ def parts_joined(scan: ScanEvidence) -> Iterator[Finding]:
         joined, n = joined_file
         sentence = f"This file is one of {n} parts of a scan: use {joined}, which has the frames of all parts"
     elif others := other_parts(scan.source.path):
-        sentence = f"This file is a part of a run, like {others[0]}, and no file joins the parts"
+        other_part = others[0]
+        sentence = f"This file is a part of a run, like {other_part}, and no file joins the parts"
         sentence += f": {to_join(run_of(scan.source.path.resolve().parent))}"
     else:
         return

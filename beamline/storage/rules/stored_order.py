@@ -119,11 +119,12 @@ def sinogram_assumed(scan: ScanEvidence) -> Iterator[Finding]:
     if sorted(axes) == ["col", "frame"]:
         n = scan.table.views.size
         option = scan.source.exchange_sinogram(views_first=axes[0] == "frame")
+        n_cols = scan.source.shape[1]
         yield Finding(
             "info",
             SINOGRAM,
-            f"The array has two dimensions and is used as one sinogram of {n} projections and "
-            f"{scan.source.shape[1]} columns. If rows and columns are exchanged, {option}.",
+            f"The array has two dimensions and is used as one sinogram of {n} projections and {n_cols} columns. If "
+            f"rows and columns are exchanged, {option}.",
         )
 
 

@@ -200,7 +200,8 @@ def opened_reconstruction(path: Path, at: int | None = None) -> Iterator[ReconRe
             if (at is None) != (n == 0) or (at is not None and not 0 <= at < n):
                 held = "one volume, not a time series: omit --at"
                 if n:
-                    held = f"{n} volumes of a time series: choose one with --at 0 to {n - 1} (`beamline export`)"
+                    last = n - 1
+                    held = f"{n} volumes of a time series: choose one with --at 0 to {last} (`beamline export`)"
                 raise DataError(f"{path} contains {held}.")
             record = _read_entry(file["entry"], at)
         except hdf5.ALTERED as error:

@@ -340,7 +340,8 @@ class EpicsStage(LineStage):
         if unit.value != settings.unit:
             wrong, advice = f"its unit (EGU) is {unit.value!r}, expected {settings.unit!r}", "Correct unit or EGU"
         elif abs(abs(float(step.value)) * per_unit - 1) > 1e-6:
-            wrong = f"the step of the motor record (MRES) is {step.value:g} {settings.unit}, expected {1 / per_unit:g}"
+            expected_step = 1 / per_unit
+            wrong = f"the step of the motor record (MRES) is {step.value:g} {settings.unit}, expected {expected_step:g}"
             advice = "Set counts_per_turn to 360 / MRES"
         elif 0 < float(fastest.value) < greatest * (1 - 1e-9):
             wrong = (

@@ -152,14 +152,14 @@ class PiGcsStage(LineStage):
         if code not in MOTION or code == self._reported:
             return
         self._reported = code
+        place = self._travel.degrees(self._axis.counts())
         raise DeviceError(
             self.name,
             f"the axis was disturbed since its last move: {meaning(code)}",
             reply=str(code),
             expected="an axis at rest",
             advice=f"{advice(code)}. Frames taken since that move may have another angle than stated",
-            state="Nothing has moved because of this request; the stage is at "
-            f"{self._travel.degrees(self._axis.counts())}",
+            state=f"Nothing has moved because of this request; the stage is at {place}",
         )
 
     def _send_stop(self, hard: bool) -> str:

@@ -98,7 +98,10 @@ def steepest_code(acceleration: float) -> int:
     """
     codes = [code for code, ms in enumerate(RATES) if 1e6 / ms <= acceleration * (1 + 1e-9)]
     if not codes:
-        raise ValueError(f"{acceleration:g} pulses/s² is below the controller's least acceleration, {1e6 / RATES[0]:g}")
+        least_acceleration = 1e6 / RATES[0]
+        raise ValueError(
+            f"{acceleration:g} pulses/s² is below the controller's least acceleration, {least_acceleration:g}"
+        )
     return codes[-1]
 
 

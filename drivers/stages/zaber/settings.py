@@ -134,10 +134,11 @@ class ZaberSettings(Wiring, StageFigures):
         speed = round(self.max_speed * per_radian)
         steepest = math.floor(self.acceleration * per_radian / 1e4 * (1 + 1e-9))
         if speed < 1 or steepest < 1:
+            least = math.degrees(1e4 / per_radian)
             raise ValueError(
-                f"{math.degrees(self.max_speed):g} deg/s and {math.degrees(self.acceleration):g} deg/s² "
-                f"are the native values {speed} and {steepest}, but both must be 1 or more. The smallest acceleration "
-                f"is {math.degrees(1e4 / per_radian):g} deg/s²"
+                f"{math.degrees(self.max_speed):g} deg/s and {math.degrees(self.acceleration):g} deg/s² are the "
+                f"native values {speed} and {steepest}, but both must be 1 or more. The smallest acceleration is "
+                f"{least:g} deg/s²"
             )
         return speed, steepest
 

@@ -256,9 +256,10 @@ def without_learnt_gains(views: PreparedProjections, progress: Progress) -> Step
         return StepDone(sentence, {"learnt_gains": sentence, **values})
     for view in views.lines.data:
         view -= learnt.pixels
+    spread = float(learnt.pixels.std())
     sentence = (
-        f"Pixel sensitivities were corrected by {float(learnt.pixels.std()):.4f} in line integral (standard "
-        f"deviation); {judged}. Columns within {NEAR_AXIS:g} of the axis were not corrected, because a wrong "
-        "sensitivity there looks like an object on the axis."
+        f"Pixel sensitivities were corrected by {spread:.4f} in line integral (standard deviation); {judged}. "
+        f"Columns within {NEAR_AXIS:g} of the axis were not corrected, because a wrong sensitivity there looks like "
+        "an object on the axis."
     )
     return StepDone(sentence, {"learnt_gains": sentence, "learnt_gains_of_pixels": learnt.pixels, **values})

@@ -155,10 +155,11 @@ class Phase:
                 "--phase paganin:RATIO."
             )
             return replace(self, explanation=f"{overshoot.in_words()} {why}")
+        relative_error = filter.factor - 1
         why = (
             "A phase filter was applied, because it lowers the residual in held-out projections by "
             f"{filter.gain:.0%}. The held-out projections determine the square of the filter's length to within "
-            f"{filter.factor - 1:.0%}. --phase none omits the filter."
+            f"{relative_error:.0%}. --phase none omits the filter."
         )
         return replace(self, length=filter.length, explanation=f"{overshoot.in_words()} {why}")
 
@@ -196,7 +197,8 @@ class Phase:
         values = {"--distance-mm": distance, "--energy-kev": energy, "--pixel-size-um": pitch}
         missing = [option for option, value in values.items() if value is None]
         if missing and self.length is None:
-            raise ConfigError(f"--phase needs {' and '.join(missing)}, which {source.path} does not state.")
+            missing_values = " and ".join(missing)
+            raise ConfigError(f"--phase needs {missing_values}, which {source.path} does not state.")
         length, sentence = self.length or 0.0, "from held-out projections"
         if not missing:
             assert distance is not None and energy is not None and pitch is not None
@@ -210,10 +212,11 @@ class Phase:
             length = math.sqrt(ratio) * unit
         paganin = Paganin(length, self.unsharp)
         if paganin.length > max(source.shape) / selection.binning:
+            n_rows = source.shape[0]
+            n_cols = source.shape[1]
             raise ConfigError(
                 f"Check ratio, energy (keV) and distance (mm) of --phase: {sentence}, gives a filter over "
-                f"{paganin.length:.4g} pixels, but {source.path} has only {source.shape[0]} x "
-                f"{source.shape[1]} pixels."
+                f"{paganin.length:.4g} pixels, but {source.path} has only {n_rows} x {n_cols} pixels."
             )
         mask = "" if paganin.unsharp is None else "; unsharp mask of {:g} px by {:g}".format(*paganin.unsharp)
         sentence = f"Phase retrieval with Paganin's filter over {paganin.length:.3g} pixels ({sentence}){mask}."

@@ -69,7 +69,8 @@ def angles_in(names: Sequence[str]) -> NamedAngles:
     another = any(len({*each}) > 1 and not are_a_count(each) for each in zip(*others, strict=False))
     doubt = _doubt_of_series(chosen, np.unique(degrees), doubt, words=words, another=another)
     if doubt:
-        doubt = f"angles in names such as {stems[-1]} are not used, because {doubt}"
+        example = stems[-1]
+        doubt = f"angles in names such as {example} are not used, because {doubt}"
     plain = [_without(name, match) for name, match in zip(names, chosen, strict=True)]
     return NamedAngles(plain, None if doubt else np.radians(degrees), doubt)
 

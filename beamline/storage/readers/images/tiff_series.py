@@ -298,11 +298,14 @@ def _open_scene(folder: Path) -> ScanSource:
     scanner, angles = meta["scanner"], {str(view["file_path"]): float(view["angle"]) for view in meta["proj_train"]}
     beams = {"cone": (float(scanner["DSO"]), float(scanner["DSD"])), "parallel": None}
     if (mode := scanner["mode"]) not in beams or not angles:
-        raise DataError(f"{folder / _META} states {len(angles)} views in the mode {mode!r}; expected cone or parallel.")
+        meta_path = folder / _META
+        raise DataError(f"{meta_path} states {len(angles)} views in the mode {mode!r}; expected cone or parallel.")
     if lost := [name for name in angles if not is_below(folder, name)]:
+        meta_file = folder / _META
+        example = lost[0]
         raise DataError(
-            f"{folder / _META} lists {len(angles)} projections, but {len(lost)} of the files do not "
-            f"exist, such as {lost[0]}. Download them, or remove them from the list. Nothing was read."
+            f"{meta_file} lists {len(angles)} projections, but {len(lost)} of the files do not exist, such as "
+            f"{example}. Download them, or remove them from the list. Nothing was read."
         )
     source = TiffSeriesSource(folder, listed=[*angles])
     source.format, source.quantity = "r2_gaussian_scene", "line_integrals"

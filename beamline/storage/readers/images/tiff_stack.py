@@ -57,7 +57,8 @@ class TiffStackSource(ScanSource):
                 raise
         if complaints.messages:
             self._tif.close()
-            raise DataError(f"{path} cannot be read completely: it is cut off or damaged ({complaints.messages[0]}).")
+            complaint = complaints.messages[0]
+            raise DataError(f"{path} cannot be read completely: it is cut off or damaged ({complaint}).")
         self.table = FrameTable.of(np.full(n, FrameKind.PROJECTION))
         self.facts = {"pages": len(self._tif.pages), "bigtiff": "yes" if self._tif.is_bigtiff else "no"}
         self.not_used += offered(self)

@@ -113,7 +113,8 @@ def _header(path: Path, file: TxrmFile) -> tuple[tuple[int, int, int], np.dtype[
     info = {name: file.number(f"ImageInfo/{name}") for name in ("ImageHeight", "ImageWidth", "NoOfImages", "DataType")}
     lost = [name for name, value in info.items() if value is None]
     if lost:
-        raise DataError(f"{path} is not a .txrm scan: the stream ImageInfo/{lost[0]} is missing.")
+        lost_stream = lost[0]
+        raise DataError(f"{path} is not a .txrm scan: the stream ImageInfo/{lost_stream} is missing.")
     rows, cols, planned, kind = (int(value) for value in info.values() if value is not None)
     n = min(planned, taken if (taken := file.number("ImageInfo/ImagesTaken")) is not None else planned)
     if min(rows, cols) < 1 or rows * cols > 2**31:
@@ -180,7 +181,8 @@ def _shifts(path: Path, file: TxrmFile, n: int) -> NDArray[np.float64]:
     shifts_by_axis = [file.numbers(f"Alignment/{axis}-Shifts", "<f4", n) for axis in "XY"]
     shifts = np.stack([np.zeros(n) if each is None else -each.astype(np.float64) for each in shifts_by_axis], axis=1)
     if not np.isfinite(shifts).all():
-        raise DataError(f"{path} is damaged: {(~np.isfinite(shifts)).sum()} shifts of projections are not numbers.")
+        n_bad = (~np.isfinite(shifts)).sum()
+        raise DataError(f"{path} is damaged: {n_bad} shifts of projections are not numbers.")
     return shifts
 
 

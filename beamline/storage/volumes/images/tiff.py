@@ -103,8 +103,9 @@ class TiffFolderVolume:
         first = next((z for z in range(shape[0]) if _slice(path, z).name not in there), None)
         if first is not None:
             missing = shape[0] - sum(_slice(path, z).name in there for z in range(min(shape[0], first + len(there))))
+            n_slices = shape[0]
             raise DataError(
-                f"{missing} of {shape[0]} slices are missing in {path} (first: {_slice(path, first).name})."
+                f"{missing} of {n_slices} slices are missing in {path} (first: {_slice(path, first).name})."
             )
         yield record_of(path, facts, _Stack(path, shape))
 
@@ -130,7 +131,8 @@ class _Stack:
         except UNREADABLE as error:
             raise DataError(f"{path} cannot be read ({error}).") from error
         if values.shape != self.shape[1:]:
-            raise DataError(f"{path} has shape {values.shape}, but slice 0 has {self.shape[1:]}.")
+            first_shape = self.shape[1:]
+            raise DataError(f"{path} has shape {values.shape}, but slice 0 has {first_shape}.")
         return values
 
 

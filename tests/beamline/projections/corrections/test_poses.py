@@ -123,7 +123,9 @@ def test_vectors_state_all_of_the_geometry(tmp_path: Path, cone: bool, selected:
     pixels = round(found.geometry.pixel_pitch / geometry.pixel_pitch)
     left = found.seen.data - shadow_of_pixels(found.geometry, pixels)
     assert np.abs(left).max() < 2e-3  # counts are rounded
-    assert found.origin.done["poses"].sentence == f"The geometry of 40 projections comes from the ASTRA vectors in {text}."
+    assert (
+        found.origin.done["poses"].sentence == f"The geometry of 40 projections comes from the ASTRA vectors in {text}."
+    )
 
 
 def test_vectors_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path) -> None:
