@@ -224,10 +224,9 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
             f"{np.ptp(series) + 1} angles, one for each number, each image would get its own angle"
         )
     elif series is not None and n < angles.size != frames:
-        lost = angles.size - n
         message += (
             f". The image numbers run from {series.min()} to {series.max()} without a gap. If the scan "
-            f"had {angles.size} images, either the first {lost} or the last {lost} are missing"
+            f"had {angles.size} images, the first or the last {angles.size - n} images are missing"
         )
     if angles.size < n:
         return (
