@@ -30,7 +30,7 @@ from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.ordered_fista import MANY_SUBSETS, Subsets, ordered_fista, pull_methods, subsets_of
 from recon.voxels.priors import TvWeight, pnp_dct, tv_prox
 from recon.voxels.projector import Projector
-from recon.voxels.trial import TV_STEPS, Trial, TrialSettings, choose_patches, choose_weight
+from recon.voxels.trial import EARLY_TV_STEPS, Trial, TrialSettings, choose_patches, choose_weight
 from recon.voxels.voxel_problem import VoxelProblem
 
 FINISH_SWEEPS = 8
@@ -81,7 +81,7 @@ def refine(problem: VoxelProblem, x: F32, weight: TvWeight, strength: float, swe
     """Total-variation iterations that start from x [y, x, z], followed by PnP-DCT steps if `strength` is above 0."""
     count = subsets_of(problem.projector.geometry, MANY_SUBSETS, to_the_end=False)
     parts = Subsets.of(problem, count, to_the_end=False)
-    x = ordered_fista(problem, x, weight, parts, sweeps=sweeps, prox=tv_prox(problem, TV_STEPS))
+    x = ordered_fista(problem, x, weight, parts, sweeps=sweeps, prox=tv_prox(problem, EARLY_TV_STEPS))
     problem.decide.settings[REFINEMENT] = FistaTv.name
     if not (problem.go_on.going and strength):
         return x

@@ -24,7 +24,7 @@ from recon.voxels.held_out import EARLY_CHOICE_SWEEPS, TRIAL_SWEEPS, choice_swee
 from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.ordered_fista import MANY_SUBSETS, pull_methods, subsets_of
 from recon.voxels.projector import Projector
-from recon.voxels.trial import TV_STEPS
+from recon.voxels.trial import EARLY_TV_STEPS
 from recon.voxels.voxel_problem import TotalVariationProx, difference_weights
 
 FINISH_SHARE = 0.8
@@ -51,7 +51,7 @@ def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
     begin = now()
     x = projector.adjoint_lines(projector.forward_lines(np.ones((*grid.shape[1:], grid.shape[0]), np.float32)))
     projected = now()
-    TotalVariationProx(x.shape, difference_weights(grid), True, TV_STEPS)(x, float(x.max()) / 100)
+    TotalVariationProx(x.shape, difference_weights(grid), True, EARLY_TV_STEPS)(x, float(x.max()) / 100)
     parts = subsets_of(geometry, MANY_SUBSETS, to_the_end=False)
     return (projected - begin) * geometry.n_views / sampled.n_views + (now() - projected) * parts
 

@@ -24,7 +24,7 @@ from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
 from recon.voxels.ordered_fista import MANY_SUBSETS, SUBSETS, Subsets, ordered_fista, subsets_of
 from recon.voxels.priors import TvWeight, pnp_dct, tv_prox
 from recon.voxels.standstill import MOST_SWEEPS, USUAL_SWEEPS, Standstill, with_quality
-from recon.voxels.trial import PATCH_STEPS, TV_STEPS, Trial, choose_patches, choose_weight
+from recon.voxels.trial import EARLY_TV_STEPS, PATCH_STEPS, TV_STEPS, Trial, choose_patches, choose_weight
 from recon.voxels.voxel_problem import (
     NORM,
     Buffers,
@@ -71,7 +71,7 @@ class FistaTv(HalfVoxels):
     iterations: Count = MOST_SWEEPS
     tv_weight: NonNegative | None = None
     subsets: Count = SUBSETS
-    tv_steps: Count = 12
+    tv_steps: Count = TV_STEPS
     still: NonNegative = STANDS_STILL
     allow_negative: bool = False
     half_voxels: bool | None = None
@@ -136,7 +136,7 @@ class EarlyTv(FistaTv):
 
     iterations: Count = TRIAL_SWEEPS
     subsets: Count = MANY_SUBSETS
-    tv_steps: Count = TV_STEPS
+    tv_steps: Count = EARLY_TV_STEPS
 
     to_the_end: ClassVar[bool] = False
 

@@ -111,23 +111,27 @@ class MaterialTrial:
             best, chosen = self._better(best, chosen, COUNTS[-1] + 1, share)
         count = len(chosen.levels)
         best, chosen, tv_share = self._share_of_smoothing(best, chosen, least_share)
-        if not significantly_better(best, self.smooth, LEAST_GAIN):
+        early = self._trial.settings.early
+        if not significantly_better(best, self.smooth, LEAST_GAIN if early else 0.0):
             return None
         weakly, _ = self._tried(count, chosen.tv_share, WEAK_PULL)
         if self._trial.ended or significantly_better(weakly, best, LEAST_GAIN):
             return None
         # For a fit, the same number of further iterations of total variation also predicts smooth samples better.
-        if self._trial.settings.early:
+        if early:
             continued = self._trial.volume_of_weight(self._weight, self._start, self._sweeps)
             if not significantly_better(best, self._trial.residuals(continued), LEAST_GAIN):
                 return None
-        materials = chosen._replace(tv_share=tv_share)
-        if (
-            self._trial.residuals(self._volume_by(pull_to(materials, self._trial.problem, self._start))).mean()
-            >= self.smooth.mean()
-        ):
-            materials = materials._replace(noise=LEAST_NOISE)
-        return best, materials
+        clearly = significantly_better(best, self.smooth, LEAST_GAIN)
+        for noise in (NOISE, LEAST_NOISE):
+            materials = chosen._replace(tv_share=tv_share, noise=noise)
+            if (noise == LEAST_NOISE and clearly) or self._as_made(materials).mean() < self.smooth.mean():
+                return best, materials
+        return None
+
+    def _as_made(self, materials: MaterialPrior) -> F64:
+        """Residuals [view] of a volume as it will be made with these levels."""
+        return self._trial.residuals(self._volume_by(pull_to(materials, self._trial.problem, self._start)))
 
     def _share_of_smoothing(
         self, best: F64, chosen: MaterialPrior, least_share: float

@@ -27,7 +27,7 @@ from recon.voxels.ordered_fista import MANY_SUBSETS, SUBSETS, Subsets, ordered_f
 from recon.voxels.priors import TvWeight, tv_prox
 from recon.voxels.projector import volume_lines
 from recon.voxels.standstill import MOST_SWEEPS
-from recon.voxels.trial import TV_STEPS, Trial
+from recon.voxels.trial import EARLY_TV_STEPS, TV_STEPS, Trial
 from recon.voxels.voxel_problem import Buffers, VoxelProblem
 
 MATERIALS, UNDECIDED, _OF = "materials", "undecided_share", "_of_materials"
@@ -163,7 +163,7 @@ class Discrete(HalfVoxels):
         if not problem.go_on.going:
             return x
         if materials is None:
-            return self.in_half_voxels(problem, x, mu, FistaTv.tv_steps)
+            return self.in_half_voxels(problem, x, mu, TV_STEPS)
         before = 0 if problem.decide.ended is None else problem.decide.ended.after
         x = self.pulled(problem, x, weight, materials, self.first_sweeps)
         if (ended := problem.decide.ended) is not None:
@@ -171,9 +171,7 @@ class Discrete(HalfVoxels):
         if not problem.go_on.going:
             return x
         pull = partial(pull_to, materials)
-        return self.in_half_voxels(
-            problem, x, mu * materials.tv_share, FistaTv.tv_steps, pull, self.first_sweeps - before
-        )
+        return self.in_half_voxels(problem, x, mu * materials.tv_share, TV_STEPS, pull, self.first_sweeps - before)
 
     def materials(
         self, problem: VoxelProblem, weight: TvWeight, trial: Callable[[], Trial | None]
@@ -205,7 +203,7 @@ class Discrete(HalfVoxels):
         subsets = Subsets.of(problem, count, to_the_end)
         x = ordered_fista(
             further, x, TvWeight(weight.value * materials.tv_share), subsets, sweeps=self.iterations,
-            prox=tv_prox(problem, FistaTv.tv_steps if to_the_end else TV_STEPS), pull=pull, still=self.still,
+            prox=tv_prox(problem, TV_STEPS if to_the_end else EARLY_TV_STEPS), pull=pull, still=self.still,
         )  # fmt: skip
         share = problem.decide(UNDECIDED, lambda: undecided_share(x[pull.where], materials))
         of_scan = materials.scaled(problem.units.density)._asdict()

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from recon.base.decisions import Prior
+from recon.base.decisions import MaterialPrior, Prior
 from recon.voxels.choice import (
     Prediction,
     TrialChoice,
@@ -120,6 +120,24 @@ def test_a_choice_says_why_the_lowest_residual_is_not_taken() -> None:
     by_chance = reason(1e-5, 0.0, SCATTER)
     assert "tv was chosen" in by_chance and by_chance.endswith("is smaller by more than one standard error")
     assert reason(0.1, 0.02).endswith("tv 1.000; r2 0.9000")
+
+
+@pytest.mark.parametrize(
+    ("discrete", "patches", "taken", "suffice"),
+    [(0.99, None, "discrete", False), (0.99, 0.98, "discrete", False), (0.99, 0.95, "pnp-dct", False),
+     (0.95, None, "discrete", True)],
+)  # fmt: skip
+def test_levels_that_passed_their_tests_are_taken_even_if_they_gain_little(
+    discrete: float, patches: float | None, taken: str, suffice: bool
+) -> None:
+    levels = Prior(1.0, materials=MaterialPrior((0.0, 1.0), (0.5, 0.5), 1.0, 0.02, 0.1))
+    choice = TrialChoice("16 rows").after(Prediction("fista-tv", 1 + SCATTER, Prior(1.0)))
+    choice = choice.after(Prediction("discrete", discrete + SCATTER, levels))
+    assert choice.levels_suffice is suffice
+    choice = choice.after(Prediction("pnp-dct", None if patches is None else patches + SCATTER))
+    assert choice.chosen is not None and choice.predictions[choice.chosen].name == taken
+    without = choice._replace(predictions=(choice.predictions[0], choice.predictions[1]._replace(prior=None)))
+    assert without.chosen == (1 if suffice else 0) and not without.levels_suffice
 
 
 def test_a_choice_is_the_same_from_a_file() -> None:

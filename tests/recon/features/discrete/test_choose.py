@@ -109,6 +109,25 @@ def test_fewer_voxels_are_pulled_if_the_volume_would_predict_worse_than_total_va
     assert choice.materials.levels and choice.materials.noise == noise
 
 
+@pytest.mark.parametrize(("own", "has_levels"), [(0.999, True), (1.001, False)])
+def test_levels_that_gain_little_need_a_volume_that_predicts_better_than_total_variation(
+    own: float, has_levels: bool
+) -> None:
+    """Of cracks from 90 views of 10³ photons, noise is nearly all that a volume leaves."""
+    trial: Any = ToldTrial({2: 0.995, 1: 0.985, 0.5: 0.99}, own=own)
+    choice = MaterialTrial(trial, 1.0, 16, None)
+    choice.choose()
+    assert bool(choice.materials.levels) is has_levels
+
+
+def test_levels_that_gain_little_are_not_used_for_a_fit() -> None:
+    trial: Any = ToldTrial({2: 0.995, 1: 0.985, 0.5: 0.99}, continued=1.0)
+    trial.settings = TrialSettings(early=True)
+    choice = MaterialTrial(trial, 1.0, 16, None)
+    choice.choose()
+    assert not choice.materials.levels
+
+
 @pytest.mark.parametrize(
     ("residuals_by_share", "weakly", "count"),
     [
