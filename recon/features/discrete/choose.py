@@ -35,7 +35,7 @@ weight. PnP-DCT gains 1.7 dB there.) Levels that the user gives are pulled to we
 COUNTS = (2, 3)
 """Numbers of levels that are tried (air may be one of them); four are tried if three are best."""
 _LEAST_SHARE = 1 / 16  # smallest share of the weight of total variation
-_HEAVIER = 2.0
+_HEAVIER = 1.75
 """Factor on the share of total variation that predicts the held-out projections best. The ground truth prefers 1.6 to
 2.4 times that share (packed grains, cracks and polyhedra of 192 columns from 30 and 45 projections). On scans that it
 was not found on, the factor 1 costs: ellipsoids from 36 projections -1.7 dB, a cathode from 90 -1.0, polyhedra from 60
