@@ -67,13 +67,13 @@ def chosen_share(residuals_by_share: dict[float, float]) -> float:
 @pytest.mark.parametrize(
     ("residuals_by_share", "share"),
     [
-        ({2: 0.98, 1: 0.95, 0.5: 0.96}, 2 * 2**-0.25),  # the parabola through 0.01 and 0.03 more
-        ({2: 0.95, 1: 0.95, 0.5: 0.96}, 2 * 2**0.5),  # twice the weight predicts as well
-        ({2: 0.98, 1: 0.80, 0.5: 0.70, 0.25: 0.69}, 1 * 2**-0.5),  # half of it predicts better, by less than 2 %
-        ({2: 0.98, 1: 0.80, 0.5: 0.70, 0.25: 0.66, 0.125: 0.68}, 0.5 * 2 ** ((0.02 - 0.04) / (2 * 0.06))),
+        ({2: 0.98, 1: 0.95, 0.5: 0.96}, 1.75 * 2**-0.25),  # the parabola through 0.01 and 0.03 more
+        ({2: 0.95, 1: 0.95, 0.5: 0.96}, 1.75 * 2**0.5),  # twice the weight predicts as well
+        ({2: 0.98, 1: 0.80, 0.5: 0.70, 0.25: 0.69}, 1.75 / 2 * 2**-0.5),  # half of it predicts better, by less than 2 %
+        ({2: 0.98, 1: 0.80, 0.5: 0.70, 0.25: 0.66, 0.125: 0.68}, 1.75 / 4 * 2 ** ((0.02 - 0.04) / (2 * 0.06))),
     ],
 )
-def test_twice_the_share_is_taken_that_predicts_views_best(
+def test_a_heavier_share_is_taken_than_the_one_that_predicts_views_best(
     residuals_by_share: dict[float, float], share: float
 ) -> None:
     assert chosen_share(residuals_by_share) == pytest.approx(share)
