@@ -124,20 +124,21 @@ def test_a_choice_says_why_the_lowest_residual_is_not_taken() -> None:
 
 @pytest.mark.parametrize(
     ("discrete", "patches", "taken", "suffice"),
-    [(0.99, None, "discrete", False), (0.99, 0.98, "discrete", False), (0.99, 0.95, "pnp-dct", False),
-     (0.95, None, "discrete", True)],
+    [(0.99, None, "discrete", False), (0.99, 0.985, "discrete", False), (0.99, 0.975, "pnp-dct", False),
+     (0.99, 0.95, "pnp-dct", False), (0.95, None, "discrete", True)],
 )  # fmt: skip
 def test_levels_that_passed_their_tests_are_taken_even_if_they_gain_little(
     discrete: float, patches: float | None, taken: str, suffice: bool
 ) -> None:
     levels = Prior(1.0, materials=MaterialPrior((0.0, 1.0), (0.5, 0.5), 1.0, 0.02, 0.1))
-    choice = TrialChoice("16 rows").after(Prediction("fista-tv", 1 + SCATTER, Prior(1.0)))
+    choice = TrialChoice("16 rows").after(Prediction("fbp", 3 + SCATTER))
+    choice = choice.after(Prediction("fista-tv", 1 + SCATTER, Prior(1.0)))
     choice = choice.after(Prediction("discrete", discrete + SCATTER, levels))
     assert choice.levels_suffice is suffice
     choice = choice.after(Prediction("pnp-dct", None if patches is None else patches + SCATTER))
     assert choice.chosen is not None and choice.predictions[choice.chosen].name == taken
-    without = choice._replace(predictions=(choice.predictions[0], choice.predictions[1]._replace(prior=None)))
-    assert without.chosen == (1 if suffice else 0) and not without.levels_suffice
+    without = choice._replace(predictions=(*choice.predictions[:2], choice.predictions[2]._replace(prior=None)))
+    assert without.chosen == (2 if suffice else 1) and not without.levels_suffice
 
 
 def test_a_choice_is_the_same_from_a_file() -> None:
