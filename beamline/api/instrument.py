@@ -140,9 +140,9 @@ class Instrument:
         config = changed(self.config, [override_of(key, value) for key, value in wanted.items()])
         if _of_devices(config) != _of_devices(self.config):
             raise ConfigError(
-                f"{', '.join(wanted)}: at least one of these keys belongs to devices that are open, so it "
-                "would have no effect. Give it to `connect`. A single scan can change angles, times, "
-                "optics, checks, and the camera's roi, binning and readout. Nothing was started."
+                f"{', '.join(wanted)}: at least one of these keys belongs to devices that are open, so a new value "
+                "would have no effect. Give such a key to `connect` instead. A single scan can change angles, "
+                "times, optics, checks, and the camera's roi, binning and readout. Nothing was started."
             )
         return config
 

@@ -116,7 +116,7 @@ def scans_of(plan: Generator[Any, Any, Any]) -> tuple[PlannedScan, ...]:
         what = f"{type(error).__name__}: {error}"
         others.faults.append(
             ScanFault(
-                f"the plan cannot be predicted, because it raises an error if it gets no measured values ({what})"
+                f"the plan cannot be predicted, because the plan raises an error if it gets no measured values ({what})"
             )
         )
     if others.needs or others.faults:

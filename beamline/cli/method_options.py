@@ -223,9 +223,10 @@ _WITH_REFERENCE = option(
     excludes=EXCLUDED["reference"],
     type=click.Path(path_type=Path),
     metavar="GOOD",
-    help="Earlier volume of the same sample, or an earlier scan of it, which is then reconstructed first. The motion "
-    "of the sample since then, and the grey level of each particle, are estimated from the projections. Held-out "
-    "projections decide whether the earlier volume is used. If they decide against it, the result is that of auto.",
+    help="Earlier volume of the same sample, or an earlier scan of the sample, which is then reconstructed first. "
+    "The motion of the sample since the earlier scan, and the grey level of each particle, are estimated from "
+    "the projections. Held-out projections decide whether the earlier volume is used. If the earlier volume is "
+    "not used, the result is that of auto.",
 )
 _IN_TIME = together(
     option(
@@ -346,7 +347,7 @@ method_options = together(
         type=click.Path(path_type=Path, dir_okay=False),
         callback=parsed(checkpoint_output),
         help="Save the state of the fit in this file every minute, at the end and at Ctrl-C, so that --resume can "
-        "continue it.",
+        "continue the fit.",
     ),
     option(
         "--resume",
@@ -356,7 +357,7 @@ method_options = together(
         callback=checkpoint_input,
         type=click.Path(path_type=Path, dir_okay=False),
         help="Continue from this file: a fit from its checkpoint, or a volume in slabs from its OUTPUT.partial.h5. "
-        "Give the same data and options as before.",
+        "Give the data and options of the interrupted command.",
     ),
     heading(METHOD),
     _ITERATIONS,

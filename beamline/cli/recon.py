@@ -154,7 +154,7 @@ def _checked_method(context: click.Context, default: str = "") -> str:
 
 def _in_time() -> str:
     if IN_TIME is None:
-        raise click.UsageError("--volumes: this installation cannot reconstruct a time series. Leave it out.")
+        raise click.UsageError("--volumes: this installation cannot reconstruct a time series. Leave out --volumes.")
     return IN_TIME
 
 

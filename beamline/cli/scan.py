@@ -55,10 +55,12 @@ class ScanRequest:
     page: bool = set_by(
         "--page",
         is_flag=True,
-        help="Also show the run in the browser, where it can be paused and stopped, as `beamline watch --control` "
-        "does.",
+        help="Also show the run in the browser. There you can pause and stop the scan, as `beamline watch "
+        "--control` does.",
     )
-    no_live: bool = set_by("--no-live", is_flag=True, help="Do not reconstruct, neither during the scan nor after it.")
+    no_live: bool = set_by(
+        "--no-live", is_flag=True, help="Do not reconstruct the scan, neither while it runs nor afterwards."
+    )
     documents: str | None = set_by(
         "--documents",
         metavar="FILE|tcp://HOST:PORT",
@@ -320,7 +322,8 @@ def _config_of_series(config: Config | None, run: Path | None, documents: str | 
     if documents is not None:
         several = "scan.energies" if config.scan.states is None else "scan.states"
         raise click.UsageError(
-            f"--documents works only with a single scan: leave it out, because the configuration has {several}."
+            "--documents works only with a single scan: leave out --documents, because the configuration has "
+            f"{several}."
         )
     return config
 

@@ -48,9 +48,9 @@ scan_options = together(
         of_one_call=True,
         type=_PATH,
         help=(
-            "File with the angles in degrees: a text file with one angle per line, a table with a column for them, "
-            ".npy, or a dataset in an HDF5 file (in the unit that it states; FILE::NAME if there are several). "
-            "Default: the angles in the scan file."
+            "File with the angles in degrees: a text file with one angle per line, a table with a column of angles, "
+            ".npy, or a dataset in an HDF5 file (in the unit that the dataset states; FILE::NAME if there are "
+            "several datasets). Default: the angles in the scan file."
         ),
     ),
     option(
@@ -80,7 +80,7 @@ scan_options = together(
         "--data-path",
         metavar="DATASET",
         help="Name of the dataset with the projections, for an HDF5 or Zarr file of unknown layout or with several "
-        "detectors, for example /raw/images. If the dimensions are not frame,row,col, add them: "
+        "detectors, for example /raw/images. If the dimensions are not frame,row,col, add their order: "
         "/raw/images:frame,col,row.",
     ),
     option(
@@ -101,11 +101,10 @@ scan_options = together(
         "--frames",
         metavar="KINDS",
         help=(
-            "State which frames are darks and flats, for example darks=0:5,flats=5:10+95:100. All others are "
-            "projections. This option overrides the file. none=30:38+61:62 leaves these frames out. If you give only "
-            "none=, the "
-            "file states the kind of the other frames. 0::2 or 1::2: use every second projection with its darks and "
-            "flats, if two exposures or thresholds alternate."
+            "State which frames are darks and flats, for example darks=0:5,flats=5:10+95:100. All other frames are "
+            "projections. This option overrides the file. none=30:38+61:62 leaves these frames out. If you give "
+            "only none=, the file states the kind of the other frames. 0::2 or 1::2: use every second projection "
+            "with its darks and flats, if two exposures or thresholds alternate."
         ),
     ),
     option(
@@ -125,8 +124,8 @@ scan_options = together(
         of_one_call=True,
         type=_PATH,
         metavar="FILE",
-        help="File that the software of the scanner wrote next to the images (.xtekct, .log, .pca, .xml). Distances, "
-        "pixel size and angles are read from it.",
+        help="File that the software of the scanner wrote next to the images (.xtekct, .log, .pca, .xml). The "
+        "program reads distances, pixel size and angles from this file.",
     ),
     option(
         "--angles-unit",
@@ -307,9 +306,9 @@ _BEFORE = (
         "--sample-width",
         type=FiniteRange(min=0, min_open=True),
         metavar="MM",
-        help="Width of the sample in mm (in px if the pixel size is unknown), if it is wider than the field of view. "
-        "The whole sample is then reconstructed. Default: the value in the scan file; without one, the width is "
-        "estimated with held-out projections.",
+        help="Width of the sample in mm (in px if the pixel size is unknown), if it is wider than the field of "
+        "view. The whole sample is then reconstructed. Default: the value in the scan file; if the file states "
+        "no width, it is estimated with held-out projections.",
     ),
 )
 _AFTER = (

@@ -34,9 +34,11 @@ class MotorSection(Section):
         low, high, fastest = (math.degrees(rad) for rad in (figures.low, figures.high, figures.max_speed))
         for name, place in places.items():
             if not low - 1e-9 <= place <= high + 1e-9:
-                raise ValueError(f"{name} {place:g} is beyond the limits of its stage, {low:g} ... {high:g}")
+                raise ValueError(
+                    f"{name} {place:g} is beyond the limits of the stage of this device, {low:g} ... {high:g}"
+                )
         if self.speed_deg_s is not None and self.speed_deg_s > fastest * (1 + 1e-9):
-            raise ValueError(f"speed_deg_s {self.speed_deg_s:g} is above max_speed_deg_s of its stage")
+            raise ValueError(f"speed_deg_s {self.speed_deg_s:g} is above max_speed_deg_s of the stage of this device")
 
     def _places(self, degrees: Mapping[str, float], failed: str) -> StagePlaces:
         speed = self.stage.settings.max_speed if self.speed_deg_s is None else math.radians(self.speed_deg_s)

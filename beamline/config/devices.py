@@ -229,8 +229,8 @@ class DeviceSection(Section):
             with_outputs = [kind for kind, driver in STAGES.items() if driver.Settings.pulse_output is not None]
             kinds_with_outputs = " or ".join(with_outputs)
             raise ValueError(
-                f"shutter.kind: a {self.stage.kind} stage has no digital output for a shutter; set it to manual, or "
-                f"use the output of another controller (stage.kind {kinds_with_outputs})"
+                f"shutter.kind: a {self.stage.kind} stage has no digital output for a shutter; set shutter.kind to "
+                f"manual, or use the output of another controller (stage.kind {kinds_with_outputs})"
             )
         if shutter.output == taken:
             raise ValueError(f"shutter.output {taken} carries the trigger pulses of the stage; choose another output")

@@ -123,8 +123,8 @@ class TargetSection(Section):
     quality_db: float | None = setting(
         None,
         (
-            "Accepted loss in dB: the PSNR of the volume may be lower by this value than it would be after the whole "
-            "plan."
+            "Accepted loss in dB: the PSNR of the volume may be lower by this value than the PSNR that the whole "
+            "plan would give."
         ),
         gt=0,
         le=100,
@@ -149,8 +149,8 @@ class StatesSection(Section):
     )
     references: Literal["first", "each"] = setting(
         "first",
-        "Darks and flats of the states after the first one. first: the darks and flats of the first state are copied "
-        "into the files of the others. each: each state takes its own darks and flats.",
+        "Darks and flats of the states after the first one. first: the darks and flats of the first state are "
+        "copied into the files of the other states. each: the scan of each state takes its own darks and flats.",
     )
 
 
@@ -204,7 +204,8 @@ class ScanSection(Section):
     offset_views: int = setting(
         0,
         "For a sample wider than the field of view: number of angles at which the stage steps the sample across the "
-        "beam, after the other projections, so that frames cover its whole width. 0: no such frames.",
+        "beam, after the other projections, so that frames cover the whole width of the sample. 0: the sample is "
+        "not stepped.",
         ge=0,
         le=100,
     )
@@ -441,7 +442,8 @@ class Config(Section):
         energies = self.scan.energies or ([] if self.scan.energy is None else [self.scan.energy])
         if energies and isinstance(device, NoMonochromator):
             raise ValueError(
-                f"{name} needs a monochromator, but devices.monochromator.kind is none; set it, or set {name} to null"
+                f"{name} needs a monochromator, but devices.monochromator.kind is none; set a kind of monochromator, "
+                f"or set {name} to null"
             )
         low, high = getattr(device, "range_kev", None) or (0.0, math.inf)
         if beyond := [energy for energy in energies if not low <= energy <= high]:

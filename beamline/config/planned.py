@@ -97,7 +97,10 @@ def offset_places(config: Config) -> tuple[float, ...]:
         raise ValueError("set sample.diameter_mm, which determines how far the sample is stepped")
     per_unit = mover.mm_per_deg if isinstance(mover, StageMover) else float(mover.kind == "simulated")
     if not per_unit:
-        raise ValueError("devices.sample_mover cannot step the sample: set its kind to stage, and its mm_per_deg")
+        raise ValueError(
+            "devices.sample_mover cannot step the sample: set devices.sample_mover.kind to stage, and "
+            "set devices.sample_mover.mm_per_deg"
+        )
     settings, axis = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL), config.optics.axis_col
     cols = camera.timing_of(settings).shape[1]
     field = 1e-3 * config.optics.pixel_size_um * camera.binning * cols

@@ -21,7 +21,7 @@ _types: Callable[..., Mapping[str, Any]] = cache(get_type_hints)
 def port_problem(port: str) -> str:
     """The fault of a port; "" if it is possible. The name of a port (unlike a URL) has a colon only within a path."""
     wrong = re.match(r"[a-z]\w*:(?!//)|socket://(?!.+:\d+)", port, re.IGNORECASE)
-    return f"{port} is not a port; expected one such as COM3, /dev/ttyUSB0 or socket://host:7777" if wrong else ""
+    return f"{port} is not a port; expected a port such as COM3, /dev/ttyUSB0 or socket://host:7777" if wrong else ""
 
 
 SEVERAL_LINES = ("description", "pattern", "query", "line_end")  # keys whose text may have control characters

@@ -139,7 +139,7 @@ def user_message(error: BaseException) -> str:
         return f"{where}{error.strerror}. Check the path, the permissions and the disk."
     if damaged(error):
         hdf5_reason = str(error).strip(chr(39))
-        return f"The file is damaged: HDF5 says {hdf5_reason!r}. Use a copy of it, or the original."
+        return f"The file is damaged: HDF5 says {hdf5_reason!r}. Use a copy of the file, or the original."
     if isinstance(error, KeyboardInterrupt):
         return str(error) or "interrupted"
     if not isinstance(error, BeamlineError | DeviceError) and (problem := installation_problem(error)):

@@ -180,7 +180,9 @@ def text_in(path: Path, largest: int = TEXT) -> str:
         return decoded(path.read_bytes())
     except UnicodeDecodeError as error:
         raise OSError(
-            errno.EILSEQ, f"The file is not UTF-8 text: byte {error.start} is not valid. Save it as UTF-8", str(path)
+            errno.EILSEQ,
+            f"The file is not UTF-8 text: byte {error.start} is not valid. Save the file as UTF-8",
+            str(path),
         ) from error
 
 

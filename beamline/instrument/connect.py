@@ -65,7 +65,7 @@ _STATE = "Frames taken so far are in the file"
 def ask_operator(request: str) -> None:
     """Ask the operator at the terminal, and wait for Enter. Raises DeviceError without a terminal or a confirmation."""
     if not sys.stdin.isatty():
-        advice = "Run it in a terminal, or configure a shutter and a sample mover that are not moved by hand"
+        advice = "Run the scan in a terminal, or configure a shutter and a sample mover that are not moved by hand"
         raise DeviceError(
             "operator", "there is no terminal to ask the operator", request=request, advice=advice, state=_STATE
         )

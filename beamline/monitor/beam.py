@@ -25,8 +25,8 @@ from recon.base.setting import setting
 LASTS = 5  # number of projections for which a drift must last
 GROWN = 2.0  # factor on the reported drift at which it is reported again
 REMEDY = (
-    "`beamline recon` corrects this if there is air next to the sample (--air auto). Flats before and after the "
-    "projections (scan.flats.at: both) also correct it."
+    "`beamline recon` corrects this change of the beam if there is air next to the sample (--air auto). Flats "
+    "before and after the projections (scan.flats.at: both) also correct the change."
 )
 TAKEN_OFF = "`beamline recon` corrects this if there is air next to the sample (--air auto)."
 GONE = 0.5  # a drift has ended if it is below this share of the limit

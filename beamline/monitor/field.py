@@ -289,7 +289,7 @@ class PixelsCheck(Logged):
         advice = (
             f"Check the link of the camera, and the program that wrote the frames: {score:.2%} of the pixels have no "
             f"valid value (NaN, infinite or above {LARGEST:g}), more than in darks and flats. `beamline recon` fills "
-            "such pixels, and does not use a projection without any valid pixel."
+            "pixels without a valid value, and does not use a projection without any valid pixel."
         )
         return Flag(self.name, Level.ALARM if score > HALF else Level.WARN, row, score, HOLES, advice)
 
@@ -301,7 +301,7 @@ class PixelsCheck(Logged):
         advice = (
             f"Dead pixels: {dead.size}, at (row, column) {named}{' ...' if dead.size > NAMED_PIXELS else ''}. These "
             "pixels are dark in the flats, although their neighbours are not. Each dead pixel would make a ring in "
-            "its slice; `beamline recon` replaces them with their neighbours."
+            "its slice; `beamline recon` replaces dead pixels with their neighbours."
         )
         region = int(rows.min()), int(rows.max()) + 1, int(cols.min()), int(cols.max()) + 1
         return Flag(self.name, level, frame.index, score, self.warn, advice, region)

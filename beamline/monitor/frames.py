@@ -101,7 +101,7 @@ class StuckCheck(Logged):
             return CheckResult(replace(state, repeats=0))
         state = replace(state, repeats=state.repeats + 1)
         advice = (
-            "Stop and restart the camera: it or its driver delivers the same image again, "
+            "Stop and restart the camera: the camera or its driver delivers the same image again, "
             f"{count(state.repeats, 'time')} in a row (all pixels are identical)."
         )
         return CheckResult(state, Flag(self.name, Level.ALARM, frame.index, state.repeats, 0, advice))

@@ -201,10 +201,11 @@ class MotionCheck(Logged):
         if abs(across) > limit_across or abs(down) > limit_down:
             score, limit = math.hypot(across, down), min(limit_across, limit_down)
             advice = (
-                f"Fix the sample if it may move again: it jumped by {across:+.1f} px horizontally and {down:+.1f} px "
-                "vertically between two projections, because it slipped on its holder or something touched it. The "
-                "projections can still be used: `beamline recon` uses the longer part of the scan, before or after the "
-                "jump. --calibrate shifts corrects the jump instead (in a cone beam choose one part with --views)."
+                f"Fix the sample if it may move again: the sample jumped by {across:+.1f} px horizontally and "
+                f"{down:+.1f} px vertically between two projections, because it slipped on its holder or something "
+                "touched it. The projections can still be used: `beamline recon` uses the longer part of the scan, "
+                "before or after the jump. --calibrate shifts corrects the jump instead (in a cone beam choose one "
+                "part with --views)."
             )
         elif abs(turn) > limit_turn:
             score, limit = turn, limit_turn

@@ -175,7 +175,8 @@ def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
         yield BadFrames(flats, brighter, limit, (
             "the sample was in the beam, or the beam changed its shape between flats and projections. A sample can "
             f"only absorb, but the projections are locally brighter than the flats, by {brighter:.2g} in line "
-            f"integral (limit {limit:.2g}). In the rest of the frame they are hardly darker than the flats."
+            f"integral (limit {limit:.2g}). In the rest of the frame the projections are hardly darker than the "
+            "flats."
         ))  # fmt: skip
         return
     turning = depth - mean
@@ -200,9 +201,9 @@ def views_show_nothing(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     shown = [float(np.abs(part).max()) for part in (mean - np.median(mean), depth - mean)]
     if all(most < limit for most, limit in zip(shown, limits, strict=True)):
         yield BadFrames((), max(shown), max(limits), (
-            "The projections show no sample: those that were checked differ from the flats only by noise (line "
-            f"integrals below {max(shown):.2g}). Either there is no sample, or it was also in the beam during the "
-            "flats and looks the same from all sides."
+            "The projections show no sample: the projections that were checked differ from the flats only by noise "
+            f"(line integrals below {max(shown):.2g}). Either there is no sample, or the sample was also in the beam "
+            "during the flats and looks the same from all sides."
         ))  # fmt: skip
 
 

@@ -180,8 +180,8 @@ class Recording:
 
 def _foreign(path: Path) -> DataError:
     return DataError(
-        f"{path} was not written by `beamline scan`, so it cannot be followed. `beamline view {path}` "
-        f"shows what it contains, and `beamline recon {path}` reconstructs a scan."
+        f"{path} was not written by `beamline scan`, so the page cannot show this scan while it runs. `beamline view "
+        f"{path}` shows what it contains, and `beamline recon {path}` reconstructs a scan."
     )
 
 

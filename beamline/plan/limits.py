@@ -181,7 +181,7 @@ def violations(facts: PlanFacts) -> Iterator[str]:
         smallest = math.ceil(plan.n_views / MOST_PASSES)
         yield (
             f"scan.pass_views {plan.pass_views} divides {plan.n_views} projections into more than {MOST_PASSES} "
-            f"passes; set it to at least {smallest}, or to 0"
+            f"passes; set scan.pass_views to at least {smallest}, or to 0"
         )
     needed = facts.total_bytes + facts.retake_bytes
     if facts.free_bytes is not None and needed * ROOM + CLOSING > facts.free_bytes:
@@ -288,9 +288,9 @@ def _spacing(interval: int, stage: StageLimits) -> Iterator[str]:
     elif interval < least:
         fastest = interval / stage.pulse_spacing * 360 / stage.counts_per_turn
         yield (
-            f"projections are {interval} counts of the stage apart, but its trigger output needs at least {least} "
-            f"counts: {stage.pulse_spacing:g} s at its full speed of {degrees(stage.max_speed)}/s. Take fewer "
-            "projections, a shorter devices.stage.pulse_width_s if the stage has this setting, or "
+            f"projections are {interval} counts of the stage apart, but the trigger output of the stage needs at "
+            f"least {least} counts: {stage.pulse_spacing:g} s at its full speed of {degrees(stage.max_speed)}/s. "
+            "Take fewer projections, a shorter devices.stage.pulse_width_s if the stage has this setting, or "
             f"devices.stage.max_speed_deg_s <= {rounded(fastest):g}"
         )
 

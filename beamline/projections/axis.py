@@ -147,8 +147,8 @@ def _axis_by_views(
     if not estimate.confident or abs(axis_col - stated) <= _CONFIRMED * binning:
         return stated, None
     warn(
-        f"The rotation axis at column {axis_col:.2f} is used, because held-out projections agree better with it "
-        f"than with the file's column {stated:.2f}. To use the column in the file, give --axis {stated:g}."
+        f"The rotation axis at column {axis_col:.2f} is used, because held-out projections agree better with this "
+        f"column than with the file's column {stated:.2f}. To use the column in the file, give --axis {stated:g}."
     )
     return axis_col, estimate
 
@@ -259,9 +259,8 @@ def stated_axis(source: ScanSource) -> float:
     """
     if source.axis_col is None:
         raise DataError(
-            "Give the rotation axis with --axis COLUMN (0 is the centre of the first column): "
-            f"{source.path} does not state it, and the axis of a cone beam cannot be searched during the "
-            "scan."
+            f"Give the rotation axis with --axis COLUMN (0 is the centre of the first column): {source.path} does "
+            "not state the axis, and the axis of a cone beam cannot be searched during the scan."
         )
     return source.axis_col
 

@@ -106,7 +106,7 @@ def photons_of(scan: SelectedScan, references: References) -> Photons | None:
         low, high = _PHOTONS
         if not low <= n_photons <= high:
             raise ConfigError(
-                f"Give --gain in counts per photon, or omit it: --gain {model.gain:g} would mean {n_photons:.3g} "
+                f"Give --gain in counts per photon, or omit --gain: --gain {model.gain:g} would mean {n_photons:.3g} "
                 f"photons per pixel in the open beam of {source.path}; expected {low:g} to {high:g}."
             )
         variance = float(np.median(darks.var(axis=0, ddof=1))) if len(darks) > 1 else 0.0

@@ -41,9 +41,9 @@ class Preparation:
     flags: str = option(
         "--flags",
         "use",
-        "use: leave out projections with an alarm of the monitor, halve the weight of projections or "
-        "regions with a warning, and correct projections after a jump of the sample. judge: run the "
-        "monitor on the frames first and use its flags. ignore: weigh all projections equally.",
+        "use: leave out projections with an alarm of the monitor, halve the weight of projections or regions with a "
+        "warning, and correct projections after a jump of the sample. judge: run the monitor on the frames first "
+        "and use the flags of this run. ignore: weigh all projections equally.",
         choices=("use", "judge", "ignore"),
     )
     references: str = option(

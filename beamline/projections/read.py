@@ -244,11 +244,10 @@ def _copies(scan: ScanEvidence, data: NDArray[Any], frames: NDArray[np.int64]) -
         return []
     are = "is" if len(copies) == 1 else "are"
     return [
-        "Omit these frames with --views or --flags judge, or repeat them: "
-        f"{count(len(copies), 'projection')} of {scan.source.table.views.size} "
-        f"({frames_text(copies)}) {are} identical to the "
-        "projection before. The camera or its driver delivered an image twice, so the angle of "
-        "the copy is wrong."
+        "Omit these frames with --views or --flags judge, or repeat these projections: "
+        f"{count(len(copies), 'projection')} of {scan.source.table.views.size} ({frames_text(copies)}) {are} "
+        "identical to the projection before. The camera or its driver delivered an image twice, so the angle of the "
+        "copy is wrong."
     ]
 
 

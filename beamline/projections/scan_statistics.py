@@ -150,11 +150,11 @@ def _gray(material: str, source: ScanSource, photons: float) -> float:
     """
     if source.cone is not None:
         raise ConfigError(
-            f"Omit --dose-in: it is for a parallel monochromatic beam, and {source.path} is a cone-beam scan."
+            f"Omit --dose-in: this option is for a parallel monochromatic beam, and {source.path} is a cone-beam scan."
         )
     if source.pixel_size_mm is None or source.energy_kev is None:
         missing = "pixel size" if source.pixel_size_mm is None else "energy"
-        raise ConfigError(f"--dose-in needs pixel size and energy; {source.path} does not state its {missing}.")
+        raise ConfigError(f"--dose-in needs pixel size and energy; {source.path} does not state the {missing}.")
     height = source.pixel_size_mm if source.row_pitch_mm is None else source.row_pitch_mm
     try:
         return absorbed_dose(material, source.energy_kev, photons / (source.pixel_size_mm * height))

@@ -99,7 +99,7 @@ def cut_sentence(sides: dict[str, float], continued: bool, wide: bool) -> str:
     )
     return (
         f"{beyond_the_field(sides)} {fbp} methods reconstruct the full width of the sample. "
-        f"{'' if wide else advice}The edge columns are therefore not used as air reference. If they do "
+        f"{'' if wide else advice}The edge columns are therefore not used as air reference. If the edge columns do "
         "show air, and only the beam is weaker than in the flats, use --air columns."
     )
 
@@ -110,10 +110,10 @@ def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str
         f"at the {side} edge in projections {first} to {last}" for side, (first, last) in ranges.items()
     )
     return (
-        "Centre the sample on the rotation axis, or move the camera until the axis is near its edge and "
-        f"take a 360° scan: the sample leaves the field of view {words} of {n_views} and is inside it in "
-        "the others. The sample, or a part of it, is off the rotation axis. Material farther from the "
-        "axis than the edge of the detector is not reconstructed, and the rim of the volume is uncertain."
+        "Centre the sample on the rotation axis, or move the camera until the axis is near an edge of the detector "
+        f"and take a 360° scan: the sample leaves the field of view {words} of {n_views} and is inside the field of "
+        "view in the other projections. The sample, or a part of it, is off the rotation axis. Material farther "
+        "from the axis than the edge of the detector is not reconstructed, and the rim of the volume is uncertain."
     )
 
 
@@ -177,9 +177,8 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
     ):
         if dead_rows.size:
             result = so if what == "slice" else "not used, and voxels that other rows do not show are 0"
-            row_numbers = spans(dead_rows.tolist())
             warn(
-                f"No data in {count(dead_rows.size, what)} of {len(masked)} (counted from 0: {row_numbers}), because "
-                "in all projections these detector rows have no beam, zeros, no finite values, or dead pixels. "
-                f"These {what}s are {result}."
+                f"No data in {count(dead_rows.size, what)} of {len(masked)} (counted from 0: "
+                f"{spans(dead_rows.tolist())}), because in all projections these detector rows have no beam, zeros, "
+                f"no finite values, or dead pixels. These {what}s are {result}."
             )

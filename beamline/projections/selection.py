@@ -159,8 +159,8 @@ class ScanSelection(Selection):
         if self.cone is not None:
             if pitch is None:
                 raise ConfigError(
-                    f"Give --pixel-size-um (on the detector): a cone beam needs it, and {self.path} does "
-                    "not state its pixel size."
+                    f"Give --pixel-size-um (on the detector): a cone beam needs the pixel size, and {self.path} does "
+                    "not state it."
                 )
             # The central ray meets the same detector row whatever rows are read.
             meets = (self.shape[0] - 1) / 2 if self.central_row is None else self.central_row

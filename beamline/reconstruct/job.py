@@ -242,7 +242,9 @@ def with_error_bars(job: Job, result: Reconstruction, decided: Decisions) -> Rec
     if result.ending.early:
         job.channels.warn("No error bars were computed, because the reconstruction was stopped.")
         return result
-    job.say("The volume is done; its error bars are computed next. Press Ctrl-C to leave them out.", "error_bars")
+    job.say(
+        "The volume is done; its error bars are computed next. Press Ctrl-C to leave out the error bars.", "error_bars"
+    )
     method = job.options.method_for(job.prepared.geometry)
     method = {each.name: each for each in method.alternatives}.get(result.method, method)
     control = RunControl(job.stop, job.listener(), now=job.channels.clock.now)

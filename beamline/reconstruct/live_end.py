@@ -24,8 +24,9 @@ from recon.splatting.time_limit import FinalFit
 
 # Reasons to correct all projections again.
 _OUTDATED = (
-    "Correcting all projections again, for one of these reasons: new flats or darks arrived, the air columns changed, "
-    "or new angles lie between earlier ones (neighbours in angle are used to find zingers)"
+    "Correcting all projections again, for one of these reasons: new flats or darks arrived, the air columns "
+    "changed, or new angles lie between earlier angles (zingers are found by comparing projections at neighbouring "
+    "angles)"
 )
 _SEVERAL_PARTS = "Correcting all projections again at the end of the run, because the run has several parts"
 _OFFSET = "Correcting all projections again, now together with the laterally offset projections"
@@ -45,8 +46,8 @@ def ended(live: LiveScan, state: Feeds, scan: SelectedScan, usable: UsableViews)
     if usable.jumps.size:
         live.warn(
             f"The sample jumped at {frames_text(usable.jumps)}. The live volume does not correct for this jump. "
-            f"After the scan, run `beamline recon` on the file: it uses the longer part of the scan, before or after "
-            f"the jump."
+            "After the scan, run `beamline recon` on the file: `beamline recon` uses the longer part of the scan, "
+            "before or after the jump."
         )
     table = live.source.table
     why = _SEVERAL_PARTS if table.part_starts.size > 1 else _OUTDATED if outdated(state.correction) else _OFFSET

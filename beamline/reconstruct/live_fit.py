@@ -141,9 +141,9 @@ class ScanFollower:
         usable = checked_views(scan, live.warn)
         if not isinstance(self.state, Feeds):
             raise DataError(
-                f"{live.source.path}: the live fit has taken none of the {usable.frames.size} projections that can be "
-                f"used (--views {live.selection.views}). Select others with --views, or reconstruct the finished scan "
-                "without --follow. Nothing was written."
+                f"{live.source.path}: the live fit has taken none of the {usable.frames.size} projections that can "
+                f"be used (--views {live.selection.views}). Select other projections with --views, or reconstruct "
+                "the finished scan without --follow. Nothing was written."
             )
         return ended(live, self.state, scan, usable)
 

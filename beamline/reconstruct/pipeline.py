@@ -142,15 +142,15 @@ def _compile(picture: Path, channels: Channels, timing: FollowTiming) -> None:
     sink(
         StateEntered(
             "warming_up",
-            "Loading the compiled code of the fit (if none is included for this computer, it is compiled now: 1 to 2 "
-            "minutes)",
+            "Loading the compiled code of the fit (if the installation has no compiled code for this computer, the "
+            "code is compiled now: 1 to 2 minutes)",
             time=clock.now(),
         )
     )
     warm_up(R2(finish=0), on_kernel=compiled)
     message = (
-        f"The live reconstruction is ready. To watch it, open {picture}: it shows slices from the eighth projection "
-        f"on, later the volume, updated about every {timing.snapshot:g} s"
+        f"The live reconstruction is ready. To watch the reconstruction, open {picture}: the picture shows slices "
+        f"from the eighth projection on, later the volume. It is updated about every {timing.snapshot:g} s"
     )
     sink(StateEntered("ready", message, {"picture": picture}, time=clock.now()))
 

@@ -256,8 +256,8 @@ def partly_seen_warning(geometry: Geometry) -> str:
     which = spans(partial_slices.tolist())
     n_slices = Grid.matching(geometry).shape[0]
     return (
-        f"Slices {which} of {n_slices} are seen from fewer angles than the others, because the projections are at "
-        "different heights. The volume has streaks in these slices, and FBP gives too low densities."
+        f"Slices {which} of {n_slices} are seen from fewer angles than the other slices, because the projections are "
+        "at different heights. The volume has streaks in these slices, and FBP gives too low densities."
     )
 
 

@@ -213,7 +213,9 @@ def box_around_sample(scan: SelectedScan) -> Region:
     if cut := reach_of(prepared.seen).beyond:
         where = " and the ".join(cut)
         return _uncut(
-            height, across, f"the sample extends beyond the field of view at the {where}, so it has no edge there"
+            height,
+            across,
+            f"the sample extends beyond the field of view at the {where}, so the sample has no edge there",
         )
     smooth = ndimage.uniform_filter(data, (1, min(3, data.shape[1]), 3))
     least = _least(smooth)

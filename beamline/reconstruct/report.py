@@ -34,7 +34,8 @@ _MATERIAL = 0.3  # a voxel is material if its density exceeds this share of the 
 # largest number of times that are shown; number of slices from which on vertical sections of them are drawn, too
 _SHOWN, _UPRIGHT = 12, 8
 _NO_REFERENCE = (
-    "Neither volume is the ground truth: if only one of them shows a feature, look for it in the projections."
+    "Neither volume is the ground truth: if only one of the volumes shows a feature, look for this feature in the "
+    "projections."
 )
 
 
@@ -128,8 +129,8 @@ def _footnotes(
         ),
         (
             views_grew(result),
-            "Time of reconstruction of R²-Gaussian: from the first reading of the growing file to the volume, so it "
-            "includes the scan.",
+            "Time of reconstruction of R²-Gaussian: from the first reading of the growing file to the volume, so "
+            "the time of the scan is included.",
         ),
         (
             bool(result.ending.resumed_from),
@@ -178,8 +179,9 @@ def _further(
     if facts.flagged:
         yield Picture(
             "Flagged frames",
-            "The worst of the frames that the monitor flagged, as the camera recorded them, with the flagged region if "
-            "there is one. Red: alarm, the projection is not used. Orange: warning, it has half the weight.",
+            "The worst of the frames that the monitor flagged, as the camera recorded them, with the flagged region "
+            "if there is one. Red: alarm, the projection is not used. Orange: warning, the projection has half the "
+            "weight.",
             contact_sheet(facts.flagged),
         )
 

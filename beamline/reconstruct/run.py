@@ -157,13 +157,13 @@ def refuse_views(method: Method, geometry: Geometry) -> None:
     """Raise ConfigError, before any work, if error bars cannot be computed from these projections."""
     if geometry.n_views < LEAST_VIEWS:
         raise ConfigError(
-            f"--uncertainty needs at least {LEAST_VIEWS} projections, because it splits them into two halves; there "
-            f"are {geometry.n_views}. Leave out --uncertainty, or use more projections."
+            f"--uncertainty needs at least {LEAST_VIEWS} projections, because the projections are split into two "
+            f"halves; the scan has {geometry.n_views} projections. Leave out --uncertainty, or use more projections."
         )
     if isinstance(method, Fit) and method.finish_sweeps == 0:
         raise ConfigError(
-            f"--uncertainty needs the voxel refinement of {method.name}, but --finish 0 switches it off. Leave out one "
-            "of the two."
+            f"--uncertainty needs the voxel refinement of {method.name}, but --finish 0 switches it off. Leave out "
+            "one of the two options."
         )
 
 

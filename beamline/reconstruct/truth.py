@@ -76,7 +76,9 @@ def fit_truth(truth: NDArray[np.float32], grid: Grid, binning: int) -> Volume:
         n = binning
         truth = truth[: z * n, : y * n, : x * n].reshape(z, n, y, n, x, n).mean(axis=(1, 3, 5), dtype=np.float32)
     if not np.isfinite(truth).all() or np.ptp(truth) == 0:
-        raise ConfigError("--truth cannot be used for a comparison, because it is constant or has no finite value.")
+        raise ConfigError(
+            "--truth cannot be used for a comparison, because the ground truth is constant or has no finite value."
+        )
     return Volume(truth, grid)
 
 

@@ -283,8 +283,8 @@ def _unused_levels(result: Reconstruction) -> str:
         return ""
     stated = ", ".join(f"{level:g}" for level in np.ravel(levels))
     return (
-        f"The levels {stated} were not used, because held-out projections are not predicted better with them, "
-        "or because a weaker pull predicts them better still (the density then varies within a material). "
-        "The volume is the FISTA-TV volume. Levels are densities in the unit of the volume; do not list the "
-        "density of air. Leave out --levels to have the levels determined from the scan."
+        f"The levels {stated} were not used, because held-out projections are not predicted better with them, or "
+        "because a weaker pull to the levels predicts the projections still better (the density then varies within "
+        "a material). The volume is the FISTA-TV volume. Levels are densities in the unit of the volume; do not "
+        "list the density of air. Leave out --levels to have the levels determined from the scan."
     )

@@ -314,7 +314,8 @@ class Acquisition:
         if text := discrepancies(self._done):
             raise LedgerError(
                 f"{text.strip()} All other frames are in the file with the angle of their trigger. Repeat the "
-                "missing projections, or reconstruct without them. A longer period_s gives the camera more time.",
+                "missing projections, or reconstruct without these projections. A longer period_s gives the camera "
+                "more time.",
                 self.missing,
             )
 

@@ -98,7 +98,7 @@ def hold_for_backlog(pause: PauseRequest, most: int, waiting: int, checking: flo
         pause.hold(
             Cause.BACKLOG,
             f"{what}: {waiting} of at most {most} frames wait in memory. The scan pauses, and continues "
-            f"automatically when most of them are written. To avoid such pauses, use {advice}",
+            f"automatically when most of these frames are written. To avoid such pauses, use {advice}",
         )
     elif 4 * waiting <= most:
         pause.release(Cause.BACKLOG)

@@ -206,15 +206,15 @@ def ask(run: Path, verb: Verb | Choice) -> Asked:
         raise ConfigError(f"no scan is running in {run}. Nothing was changed.")
     if isinstance(verb, Choice) and (state := state_of(part)) is not State.ASKING:
         raise ConfigError(
-            f"the scan in {run} is not waiting for a decision on what to measure next: it is {state}. "
-            "With scan.decide: ask, it waits after each pass of projections. Nothing was changed."
+            f"the scan in {run} is not waiting for a decision on what to measure next: it is {state}. With "
+            "`scan.decide: ask`, a scan waits after each pass of projections. Nothing was changed."
         )
     try:
         request.touch()
     except OSError as error:
         raise DataError(
-            f"{run} does not accept {verb}: {error.strerror}. Only the user who started a scan can control it; Ctrl-C "
-            "at its terminal stops it."
+            f"{run} does not accept {verb}: {error.strerror}. Only the user who started a scan can control the scan; "
+            "Ctrl-C at its terminal stops the scan."
         ) from error
     return Asked(part, verb, time.monotonic())
 

@@ -93,7 +93,10 @@ class FlaggedFrames:
         if not self._unchecked:
             return ""
         frames = f"{count(len(self._unchecked), 'frame')} ({spans(self._unchecked)})"
-        return f"The monitor did not check {frames}: they have no flags. `beamline monitor {path}` checks them."
+        return (
+            f"The monitor did not check {frames}, so these frames have no flags. `beamline monitor {path}` checks "
+            "all frames."
+        )
 
     def _frames(self, which: Callable[[Flag], bool]) -> set[int]:
         """Frames with such a flag, without those that were taken again."""

@@ -148,8 +148,8 @@ def abort_watch(stop: StopRequest, say: Callable[[str], None]) -> Callable[[], b
             due = stop.seconds + _SAY_EVERY
             waited = f"{stop.seconds:.0f} of at most {most:.0f} s"
             say(
-                f"Waiting for the live volume from the projections taken so far ({waited}). Press Ctrl-C to "
-                "finish without it"
+                f"Waiting for the live volume from the projections taken so far ({waited}). Press Ctrl-C to finish "
+                "without a live volume"
             )
         return stop.aborting
 

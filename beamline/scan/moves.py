@@ -61,7 +61,9 @@ def stand(stage: RotationStage, clock: Clock, stop: StopRequest) -> None:
     while stage.moving():
         stop.refuse_abort()
         if clock.now() > deadline:
-            raise InstrumentError(f"Use the emergency stop of {stage.name}: it is still moving after a stop command.")
+            raise InstrumentError(
+                f"Use the emergency stop of {stage.name}: the stage is still moving after a stop command."
+            )
         clock.sleep(POLL)
 
 
@@ -78,8 +80,8 @@ def looked_again(stage: RotationStage, angle: float, before: float) -> tuple[flo
     motion = "is moving " if moving else ""
     return after, (
         f"the frame was exposed while the stage was not at the planned angle of {math.degrees(angle):.4f}°, although "
-        f"it had reported its arrival there: it was at {math.degrees(before):.4f}° before the exposure and "
-        f"{motion}at {math.degrees(after):.4f}° after it. {ASTRAY_ADVICE}"
+        f"the stage had reported its arrival there. The stage was at {math.degrees(before):.4f}° before the exposure "
+        f"and {motion}at {math.degrees(after):.4f}° after it. {ASTRAY_ADVICE}"
     )
 
 
@@ -99,7 +101,9 @@ def set_shutter_and_sample(devices: Devices, block: Block, warm_up: Callable[[],
         if cold:
             warm_up()
     if wrong := _wrong_shutter(kind, shutter.is_open()):
-        raise InstrumentError(f"{shutter.name}: {wrong}. Check its interlock. Earlier frames are in the file.")
+        raise InstrumentError(
+            f"{shutter.name}: {wrong}. Check the interlock of the shutter. Earlier frames are in the file."
+        )
 
 
 def remembered_places(devices: Devices, kind: FrameKind, stop: StopRequest) -> dict[str, Callable[[], str]]:
@@ -124,7 +128,7 @@ def require_in_place(looks: dict[str, Callable[[], str]], kind: FrameKind, rows:
         raise InstrumentError(
             f"{'; '.join(f'{name}: {problem}' for name, problem in moved.items())}. The device was moved while "
             f"{how_many} (frames {row_numbers} of the file) were taken. Do not use these frames, because it is not "
-            "known which of them are affected. Find out who or what moved the device, move it back, and repeat the "
+            "known which frames are affected. Find out who or what moved the device, move it back, and repeat the "
             "scan. Frames taken before are good."
         )
 

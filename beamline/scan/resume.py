@@ -90,8 +90,8 @@ class ResumableRun:
             all_views = "the projections that were planned" if self.choices else f"{self.planned} projections"
             missing_kinds = " and ".join(kinds)
             return (
-                f"Preparing: {self.run} has all {all_views}; the {missing_kinds} that are missing at its end are "
-                "taken now"
+                f"Preparing: {self.run} has all {all_views}; the {missing_kinds} that are missing at the end of the "
+                "run are taken now"
             )
         if self.choices:  # some projections were omitted by a decision, or are taken twice
             return f"Preparing: {missing} of the projections planned for {self.run} are missing and are taken now"
@@ -167,12 +167,12 @@ def _alone(run: Path) -> Iterator[WriterLock]:
         lock = WriterLock(run / EVENTS, exclusive=True)
     except OSError as error:
         raise ConfigError(
-            f"{run} cannot be locked ({error.strerror}): another process is continuing or recovering it, "
-            f"or it is write-protected. {_UNTOUCHED}"
+            f"{run} cannot be locked ({error.strerror}): another process is continuing or recovering this run, or "
+            f"the run is write-protected. {_UNTOUCHED}"
         ) from None
     try:
         if alive(parts_of(run)[-1]):
-            raise ConfigError(f"The scan of {run} is still running: wait until it ends, or stop it. {_UNTOUCHED}")
+            raise ConfigError(f"The scan of {run} is still running: wait until the scan ends, or stop it. {_UNTOUCHED}")
         yield lock
     finally:
         lock.release()
@@ -227,7 +227,9 @@ def _refuse_whole(run: Path, parts: list[Path], closed: bool) -> None:
     whole = f"{run} has all projections, darks and flats that were planned"
     if closed and (len(parts) == 1 or is_joined(run / JOINED)):
         raise NothingMissing(f"{whole}: nothing is missing. {_UNTOUCHED}")
-    what = f"{JOINED} does not have the frames of its {len(parts)} parts" if closed else "a file was not closed"
+    what = (
+        f"{JOINED} does not have all frames of the {len(parts)} parts of the run" if closed else "a file was not closed"
+    )
     raise NotJoined(f"{whole}, but {what}: `beamline recover {run}` fixes that. {_UNTOUCHED}")
 
 

@@ -44,7 +44,7 @@ class Retakes:
             self.sink(
                 Warned(
                     f"{n_bad} projections were flagged or gave no frame, but only {len(chosen)} may be taken again "
-                    f"(monitor.retake_share). The other {n_left} remain as they are."
+                    f"(monitor.retake_share). The other {n_left} projections remain as they are."
                 )
             )
         seconds = self.timeline.retake_seconds * len(chosen) / self.timeline.plan.retakes

@@ -185,7 +185,9 @@ class _Turns:
         if self.last is not None and self.every is not None:
             due, late = self.last + self.every, due - self.last - self.every
             if late > SLICE:
-                measurement.sink(Warned(f"{name} begins {late:.0f} s late, because the state before it took longer."))
+                measurement.sink(
+                    Warned(f"{name} begins {late:.0f} s late, because the scan of the state before took longer.")
+                )
                 due = clock.now()
             else:
                 states.enter(states.state, f"{name} begins in {-late:.0f} s")

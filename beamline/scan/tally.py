@@ -102,7 +102,7 @@ def astray_views(taken: BlockTally) -> str:
     n_exposures, n_projections = sum(map(len, taken.astray.values())), len(taken.astray)
     where_text = ", ".join(where)
     return (
-        f"The stage was not at its angle in {n_exposures} exposures of {n_projections} projections "
+        f"The stage was not at the planned angle in {n_exposures} exposures of {n_projections} projections "
         f"({where_text}{more}). {ASTRAY_ADVICE}."
     )
 
@@ -124,13 +124,13 @@ def _of_block(taken: BlockTally) -> str:
         text = f"{n} of {block.n} {noun}s {'is' if n == 1 else 'are'} missing: {spans(taken.missing)}{at}."
         if taken.lost:
             text += (
-                f" {taken.lost} were exposed but never delivered by the camera: `beamline check --connect` tests "
-                "its link."
+                f" {taken.lost} were exposed but never delivered by the camera: `beamline check --connect` tests the "
+                "link of the camera."
             )
         if astray := sum(trigger in taken.astray for trigger in taken.missing):
             text += (
-                f" In {astray} of the missing projections, the stage was not at its angle in any of {TRIES} "
-                f"exposures (invalid rows)."
+                f" In {astray} of the missing projections, the stage was not at the planned angle in any of {TRIES} "
+                "exposures (invalid rows)."
             )
         if taken.ignored:
             text += f" {taken.ignored} triggers were ignored by the camera, which was not ready."
@@ -145,8 +145,8 @@ def _of_block(taken: BlockTally) -> str:
         )
     if taken.shift:
         text += (
-            f" All angles of a pass may be wrong by up to {taken.shift} steps: the pass has missing or extra "
-            "frames, and it is not known whether they are at its start or at its end."
+            f" All angles of a pass may be wrong by up to {taken.shift} steps: the pass has missing or extra frames, "
+            "and it is not known whether these frames are at the start or at the end of the pass."
         )
     if text and taken.off > DOUBTFUL:
         text += (

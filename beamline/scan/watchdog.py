@@ -256,7 +256,7 @@ def main(folder: Path, scan: int, source: RawIOBase | BytesIO) -> int:
     if frozen:
         say(
             f"The process of the scan did nothing for {FROZEN:.0f} s, so it is assumed to hang. The watchdog kills "
-            "the process, because only then it can open the ports of the devices."
+            "the process, because only then the watchdog can open the ports of the devices."
         )
         try:
             psutil.Process(scan).kill()  # the number still belongs to the process of the scan, because the pipe is open

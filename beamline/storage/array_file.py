@@ -112,9 +112,9 @@ def numpy_arrays(path: Path, mapped: Literal["r"] | None = None) -> dict[str, ND
         if "bject" not in str(error):
             raise
         raise DataError(
-            f"Save the arrays alone (numpy.save, numpy.savez): {path} contains Python objects among its "
-            "arrays. These are pickles, which this program never opens, because a pickle can run any "
-            "program. Nothing was read."
+            f"Save the arrays alone (numpy.save, numpy.savez): {path} contains Python objects among its arrays. Such "
+            "objects are pickles, which this program never opens, because a pickle can run any program. Nothing was "
+            "read."
         ) from error
 
 

@@ -144,9 +144,9 @@ def read_part(item: Any, where: Any) -> Any:
         if lacking := next(_not_installed(stored), "") if isinstance(stored, h5py.Dataset) else "":
             folders = os.environ.get("HDF5_PLUGIN_PATH") or "not set"
             raise DataError(
-                f"{lacking}, which is not installed here. Put the HDF5 plugin of this filter into a "
-                f"folder that HDF5_PLUGIN_PATH names (now {folders}), or, on a computer that has the "
-                "filter, write the file without it: h5repack -f NONE. Nothing was changed."
+                f"{lacking}, which is not installed here. Put the HDF5 plugin of this filter into a folder that "
+                f"HDF5_PLUGIN_PATH names (now {folders}), or, on a computer that has the filter, write the file "
+                "without the filter: h5repack -f NONE. Nothing was changed."
             ) from error
         raise
 

@@ -99,9 +99,9 @@ def _unopened(
         )
     if head is not None and head.open_for_writing:
         return DataError(
-            f"{path} is marked as being written. If a scan is just starting or ending, or its program was "
-            f"just killed, try again in {QUIET:.0f} s. If the program has ended, `h5clear -s {path}` "
-            "clears the mark. Nothing was read."
+            f"{path} is marked as being written. If a scan is just starting or ending, or the program that wrote the "
+            f"file was just killed, try again in {QUIET:.0f} s. If the program has ended, `h5clear -s {path}` clears "
+            "the mark. Nothing was read."
         )
     if any(lock_failure(error) is LockFailure.HELD for error in problems):
         return DataError(

@@ -107,13 +107,13 @@ def next_step(scan: Path) -> str:
         if layout.COMMITTED not in file:
             return (
                 f"The file is marked as being written, but has not changed for {QUIET:.0f} s or longer. If the "
-                f"program that wrote it has ended, `h5clear -s {scan}` clears the mark."
+                f"program that wrote the file has ended, `h5clear -s {scan}` clears the mark."
                 if abandoned(scan)
                 else f"Another program is still writing the scan file: `beamline recon {scan} --follow` reconstructs "
                 "the scan while it runs."
             )
     if held(scan):
-        return f"The scan is still running: `beamline recon {scan} --follow` reconstructs it during the scan."
+        return f"The scan is still running: `beamline recon {scan} --follow` reconstructs the scan while it runs."
     return f"{_died(abandoned(scan))}: `beamline recover {scan}` {_MAKES}."
 
 
@@ -124,8 +124,8 @@ def _step_of_run(run: Path) -> str:
     growing = head is not None and head.open_for_writing
     if lives or held(run / EVENTS, exclusively=True) or (growing and held(scan)):
         return (
-            f"The scan is still running: `beamline watch {run}` shows it, and `beamline recon {scan} "
-            "--follow` reconstructs it during the scan."
+            f"The scan is still running: `beamline watch {run}` shows the scan, and `beamline recon {scan} --follow` "
+            "reconstructs the scan while it runs."
         )
     if not files_with_frames(run):
         return "The run ended before its first frame: start the scan again."
@@ -135,7 +135,7 @@ def _step_of_run(run: Path) -> str:
         return f"{_died(lives is False or abandoned(scan))}: {resume}`beamline recover {run}` {_MAKES}."
     if head is not None and _lacks_views(run):
         return (
-            "The run ended early. It recorded the scan of another program, so it cannot be continued."
+            "The run ended early. The run recorded the scan of another program, so `beamline` cannot continue it."
             if ride
             else f"The run ended early: {resume}."
         )

@@ -71,9 +71,9 @@ def packing(
             f"{name} {printable(str(each))[1:40].strip(']')}" for name, each in zip(pair, pair_values, strict=True)
         )
         raise DataError(
-            f"{where} has the attributes {shown}, but it is unknown how they convert its numbers. In a "
-            "copy of the file, name them scale_factor and add_offset (value = stored * scale_factor + "
-            "add_offset), or store the converted values."
+            f"{where} has the attributes {shown}, but it is unknown how these attributes convert the stored numbers. "
+            "In a copy of the file, name the attributes scale_factor and add_offset (value = stored * scale_factor "
+            "+ add_offset), or store the converted values."
         )
     if pair is _CIL:
         scale, offset = 1 / scale, -offset / scale

@@ -142,8 +142,8 @@ def _of_csv(path: Path, content: str) -> PoseTable:
     cone = next((cone for cone, columns in _VECTORS.items() if columns[0] in names), None)
     if lines and len(re.split(r"[\s,]+", lines[0].strip())) == 12 and not re.search("[a-df-z]", lines[0]):
         raise ValueError(
-            f"{path} has 12 numbers per line and no names, like vectors of ASTRA. Save them under the "
-            'name of their kind, cone_vec or parallel3d_vec: python -c "import numpy as np; '
+            f"{path} has 12 numbers per line and no names, like vectors of ASTRA. Save these vectors "
+            'under the name of their kind, cone_vec or parallel3d_vec: python -c "import numpy as np; '
             f"np.savez('poses.npz', cone_vec=np.loadtxt('{path.name}'))\", and give --poses poses.npz"
         )
     _require_header(path, names, cone)
@@ -237,10 +237,13 @@ def _of_volume(path: Path, record: ReconRecord) -> PoseTable:
         np.atleast_1d(np.asarray(parameters.get(name, ()), np.float64)) for name in ("view_frames", "view_angles_deg")
     )
     if not any(name in parameters for name in POSES_KEPT) or not frames.size:
-        raise ValueError(f"{path} contains no poses: its projections were used without displacement and without tilt")
+        raise ValueError(
+            f"{path} contains no poses: the projections of this volume were used without displacement and without tilt"
+        )
     if CENTRES_KEPT in parameters:
         raise ValueError(
-            f"{path} was reconstructed with geometry vectors, but does not contain them: give the file with the vectors"
+            f"{path} was reconstructed with geometry vectors, but does not contain these vectors: give the file with "
+            "the vectors"
         )
     none, binning = np.zeros(frames.size), int(parameters.get("binning", 1))
     shifts = np.asarray(parameters.get("view_shifts_px", np.zeros((frames.size, 2))), np.float64) * binning

@@ -118,9 +118,8 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
                 return _with_view(path, head)
         if in_use is None and head.open_for_writing and (age := abs(time.time() - path.stat().st_mtime)) < QUIET:
             raise DataError(
-                f"{path} changed {age:.0f} s ago and is marked as being written, and its disk has no file "
-                f"locks. If the program that wrote it was killed, try again in {QUIET:.0f} s. Nothing was "
-                "changed."
+                f"{path} changed {age:.0f} s ago and is marked as being written, and the disk has no file locks. If "
+                f"the program that wrote it was killed, try again in {QUIET:.0f} s. Nothing was changed."
             )
         free = size(shutil.disk_usage(path.parent).free)
         say(
@@ -173,8 +172,8 @@ def _copied(path: Path, head: Superblock, target: Path) -> Recovered:
                     ending = ScanEnding("failed", gaps_in(path, copy), DIED)
                 if lost:
                     reason = (
-                        f"{ending.reason} Lost, because the scan had written them but they did not reach the "
-                        f"disk: {frames_text(lost)}."
+                        f"{ending.reason} Frames that are lost, because the scan had written them but they did not "
+                        f"reach the disk: {frames_text(lost)}."
                     )
                     ending = replace(ending, status="failed", reason=reason.strip())
                 state_ending(copy, ending)

@@ -59,8 +59,8 @@ def _names(file: h5py.File, path: Path) -> Iterator[str]:
         names = [*group]
         if len(known) + len(names) > MOST_OBJECTS or depth > DEEPEST:
             raise DataError(
-                f"{path} has more than {MOST_OBJECTS} objects, or groups more than {DEEPEST} levels deep: "
-                "it is neither a scan nor a volume. Nothing was read."
+                f"{path} has more than {MOST_OBJECTS} objects, or groups more than {DEEPEST} levels deep: the file "
+                "is neither a scan nor a volume. Nothing was read."
             )
         for name in names:
             with suppress(*_DAMAGED):

@@ -29,7 +29,7 @@ _LOADERS = (
     ),
     (
         r"one of its dependencies|WinError 126",
-        "a library that it needs was not found",
+        "a library on which this library depends was not found",
         "Install the vendor's runtime again, with all its parts",
     ),
     (

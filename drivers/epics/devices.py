@@ -13,7 +13,7 @@ from drivers.epics.channel import ProcessVariable, PvValue, open_channel, refuse
 from recon.base.setting import CheckedSettings, setting
 
 POLL = 0.05  # s between two reads while a shutter moves
-NOT_KNOWN = "It is not known whether the shutter is open: check it before anybody goes near the beam"
+NOT_KNOWN = "It is not known whether the shutter is open: check the shutter before anybody goes near the beam"
 
 
 class _PvDevice:
@@ -182,7 +182,7 @@ class PvFilter(_PvDevice):
                 request=f"{self._setter.name} = {value}",
                 reply=f"{self._status.name} is {self._status_now()}",
                 expected=f"{value}",
-                advice="Check its position, and whether this computer has write access",
+                advice="Check the position of the filter, and whether this computer has write access",
             )
 
     def remember_place(self) -> Callable[[], str]:
@@ -214,7 +214,8 @@ class MonochromatorPvs(CheckedSettings):
     status_pv: str = setting(doc="Process variable with the energy itself.", problem=url_problem)
     stop_pv: str | None = setting(
         None,
-        "Process variable that stops the monochromator if 1 is written to it; null: it cannot be stopped.",
+        "Process variable that stops the monochromator if 1 is written to it; null: the driver cannot stop the "
+        "monochromator.",
         problem=url_problem,
     )
     unit: EnergyUnit = setting(EnergyUnit.KEV, "Unit of pv and status_pv.")
@@ -284,7 +285,7 @@ class PvMonochromator(_PvDevice):
             request=f"{self._setter.name} = {wanted:.7g}",
             reply=f"{self._status.name} is {_valid(self._status, self.name)}",
             expected=f"{wanted:.7g}, within {pvs.tolerance * 1e-3 * pvs.per_kev:g}",
-            advice="Check its position, and whether this computer has write access",
+            advice="Check the energy that the monochromator reports, and whether this computer has write access",
         )
 
     def stop(self) -> None:

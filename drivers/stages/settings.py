@@ -104,7 +104,7 @@ class Wiring(CheckedSettings):
     baudrate: int = setting(115_200, gt=0)
     pulse_width: float | None = setting(
         None,
-        "Width of the trigger pulses in s; null: the driver chooses it, or the controller has a fixed width.",
+        "Width of the trigger pulses in s; null: the driver chooses the width, or the controller has a fixed width.",
         unit="s",
         gt=0,
     )

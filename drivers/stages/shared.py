@@ -115,7 +115,7 @@ class Stops:
             raise DeviceError(
                 self._name,
                 f"{purpose} was stopped while it was starting",
-                advice="Find who stopped it before you move it again",
+                advice="Find who stopped the stage before you move it again",
                 state="The stop was sent again: the stage has stopped, or is slowing down",
             ) from problem
         if problem is not None:
@@ -176,7 +176,7 @@ def while_it_moves(name: str, purpose: str, counts: int, reply: str = "") -> Dev
         name,
         f"{purpose} is not possible while it moves",
         reply=reply,
-        advice="Wait until the move ends, or stop it",
+        advice="Wait until the move ends, or stop the stage",
         state=f"The current move continues; the stage is at {counts} counts",
     )
 

@@ -88,7 +88,7 @@ def test_a_cone_beam_file_gives_back_its_geometry_and_its_sample(scan: Path) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("stated", "told"),
-    [(AXIS - 2.3, ["agree better with it than with the file's column 20.20"]), (None, []), (AXIS, [])],
+    [(AXIS - 2.3, ["agree better with this column than with the file's column 20.20"]), (None, []), (AXIS, [])],
 )
 def test_an_axis_is_found_or_kept_by_views_held_out(tmp_path: Path, stated: float | None, told: list[str]) -> None:
     path, warnings = tmp_path / "axis.h5", list[str]()

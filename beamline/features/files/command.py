@@ -166,7 +166,9 @@ def _text(value: Any) -> str:
 @scan_argument
 @scan_options
 @click.option(
-    "--deep", is_flag=True, help="Also read every frame and compare it with its stored checksum. Takes longer."
+    "--deep",
+    is_flag=True,
+    help="Also read every frame and compare its pixels with the stored checksum. The check then takes longer.",
 )
 @click.option(
     "--json",

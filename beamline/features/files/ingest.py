@@ -172,7 +172,7 @@ def _ending_of(source: ScanSource) -> ScanEnding:
         return source.ending
     if held(source.path) or time.time() - source.path.stat().st_mtime < QUIET:
         raise DataError(
-            f"{source.path} is still being written, or its program died less than {QUIET:.0f} s ago. Wait until the "
-            "scan has ended. Nothing was written."
+            f"{source.path} is still being written, or the program that wrote it was killed less than {QUIET:.0f} s "
+            "ago. Wait until the scan has ended. Nothing was written."
         )
     return replace(source.ending, status="failed", reason=DIED)

@@ -224,6 +224,8 @@ def _options(context: click.Context) -> ReconOptions:
 
     if foreign := sorted(names_given(context) & _OF_A_VOLUME):
         option = foreign[0]
-        raise click.UsageError(f"--{option} works only with whole volumes, but a sweep makes slices: leave it out.")
+        raise click.UsageError(
+            f"--{option} works only with whole volumes, but a sweep makes slices: leave out --{option}."
+        )
     target = OutputPaths(Path(gettempdir()) / "slice.h5", None, replace=True, written=False)
     return replace(options_of(context, BASELINE), target=target)

@@ -82,10 +82,10 @@ def planned_study(
 
 def _note(n_views: int) -> str:
     return (
-        f"PSNR all and SSIM all compare each volume with the volume that the same method and settings make of "
+        "PSNR all and SSIM all compare each volume with the volume that the same method and settings make of "
         f"{REFERENCE} ({n_views}). Both values show how much is lost with fewer projections, not which method is "
-        "better. They are too high, because the two volumes share projections, and therefore share some noise. "
-        "A smoother volume has higher SNR and CNR."
+        "better. The values of PSNR and SSIM are too high, because the two volumes share projections, and therefore "
+        "share some noise. A smoother volume has higher SNR and CNR."
     )
 
 

@@ -83,13 +83,15 @@ class BandsCheck(Logged):
     name: ClassVar[str] = "bands"
     bit: ClassVar[int] = 3
     unit: ClassVar[str] = "fraction of the intensity in the row or column"
-    meaning: ClassVar[str] = "rows or columns suddenly became darker or brighter, while the others did not"
+    meaning: ClassVar[str] = (
+        "some rows or columns suddenly became darker or brighter, and the rest of the frame did not"
+    )
 
     alarm: float = setting(
         0.1,
         (
-            "largest allowed loss of intensity in a row or column of the preview, compared with the others, as a "
-            "fraction"
+            "largest allowed loss of intensity in a row or column of the preview, compared with the other rows or "
+            "columns, as a fraction"
         ),
         ge=0,
         lt=1,

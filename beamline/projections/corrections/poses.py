@@ -165,8 +165,8 @@ def poses_of(scan: SelectedScan, frames: I64) -> ScanPoses | None:
     tilt = selection.step(TiltAndLens)
     if tilt.sought or tilt.tilt_deg:
         raise ConfigError(
-            "--tilt and --poses both set the roll of the projections. Omit --tilt, and add it to the "
-            f"column roll_deg of {table.path}."
+            "--tilt and --poses both set the roll of the projections. Omit --tilt, and add the tilt to the column "
+            f"roll_deg of {table.path}."
         )
     for learns in (step.asked_by for step in geometry_steps(selection) if step.geometry):
         raise ConfigError(

@@ -144,7 +144,9 @@ class TiltAndLens:
 
         source, selection = scan.source, scan.selection
         if (self.tilt_deg or self.sought) and selection.cone is not None:
-            raise ConfigError(f"Omit --tilt: it is for a parallel beam, and {source.path} is a cone-beam scan.")
+            raise ConfigError(
+                f"Omit --tilt: this option is for a parallel beam, and {source.path} is a cone-beam scan."
+            )
         if not self.tilt_deg and self.distortion is None:
             return None
         lens = self.distortion

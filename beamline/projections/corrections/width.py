@@ -141,10 +141,9 @@ class Width:
                         if geometry.is_cone
                         else "the projections are rolled or tilted, or will be calibrated for roll or tilt"
                     )
-                    exposure_arc = self.arc.split(":")[0]
                     raise ConfigError(
-                        f"Use --exposure-arc {exposure_arc} instead of {self.arc}: the readout arc (after the colon) "
-                        f"needs a parallel beam without roll or tilt, but {found}. Nothing was written."
+                        f"Use --exposure-arc {self.arc.split(':')[0]} instead of {self.arc}: the readout arc (after "
+                        f"the colon) needs a parallel beam without roll or tilt, but {found}. Nothing was written."
                     )
             elif abs(stated.arc) * reach >= _LEAST_PX:
                 motion = _Motion(stated.arc, 0.0 if bent else stated.skew)
@@ -160,11 +159,10 @@ class Width:
             replace(width, arc=abs(motion.arc)), motion.skew * selection.binning
         )
         exposure_degrees, readout_degrees = math.degrees(abs(motion.arc)), math.degrees(motion.skew * (rows - 1))
-        edge_px = abs(motion.arc) * reach
         statements = [
             *([f"each ray has the area of a pixel{f' and a blur of {blur:g} px' if blur else ''}"] if width else []),
-            *([f"a projection is the mean over {exposure_degrees:.3g} degrees ({edge_px:.2g} px at the edge of the "
-               "field of view)"] if motion.arc else []),
+            *([f"a projection is the mean over {exposure_degrees:.3g} degrees ({abs(motion.arc) * reach:.2g} px at "
+                "the edge of the field of view)"] if motion.arc else []),
             *([f"the last detector row is exposed {readout_degrees:.2g} degrees later than the first"]
               if motion.skew else []),
         ]  # fmt: skip

@@ -215,8 +215,8 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
         message = f"{name} has {angles.size} angles, but {n} of the {frames} frames are projections"
     for n_images in [field.value for field in source.not_used if field.where == OTHER_FILES][:1]:
         message += (
-            f". According to its OME metadata, {source.path} is one file of a set, and the others contain {n_images} "
-            "images: add them with --append FILE"
+            f". According to its OME metadata, {source.path} is one file of a set, and the other files contain "
+            f"{n_images} images: add the other files with --append FILE"
         )
     if series is not None and (gaps := source.attributes.get("missing_numbers")):
         message += (
@@ -231,8 +231,8 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
     if angles.size < n:
         return (
             f"{message}. Is the list cut off, or does it belong to another scan? Give one angle for each projection, "
-            "in the order of the projections. If some of the images are darks or flats, name them with --frames, or "
-            "give them with --darks and --flats."
+            "in the order of the projections. If some of the images are darks or flats, name these images with "
+            "--frames, or give them with --darks and --flats."
         )
     sinograms, window = "", evenly_spaced_window(angles, n)
     if angles.size in source.shape:
@@ -240,8 +240,8 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
         sinograms = f"If each image is a sinogram of {angles.size} projections, give --order {order}. Otherwise use"
         if not source.table.are_views.all():
             sinograms = (
-                f"If one image is a sinogram of {angles.size} projections, give it alone as FILE, and the "
-                "others with --darks and --flats. Otherwise use"
+                f"If one image is a sinogram of {angles.size} projections, give this image alone as FILE, and the "
+                "other images with --darks and --flats. Otherwise use"
             )
     message += (
         f". {sinograms or 'Use'} --angle-rows A:B to choose the {n} angles of the projections (lines A to B - 1, "

@@ -168,8 +168,8 @@ UPRIGHT = "the detector is assumed to be perpendicular to the beam"
 _ENERGY = "energy, if the beams above state none"
 _WAVELENGTH = "energy, if no beam states one"
 _DONE = (
-    "frames are corrected as if they were raw. If they were corrected before, give --quantity line-integrals, or use "
-    "the raw frames"
+    "frames are corrected as if they were raw. If the frames were corrected before, give --quantity line-integrals, "
+    "or use the raw frames"
 )
 
 NXTOMO: tuple[Entry, ...] = (
@@ -272,7 +272,7 @@ NXTOMO: tuple[Entry, ...] = (
     Entry("detector/y_pixel_offset", "pixels are assumed to be evenly spaced", False),
     Entry(
         "detector/magnification",
-        "pixel sizes are used as stated; give --pixel-size-um if they are not at the sample",
+        "pixel sizes are used as stated; give --pixel-size-um if the stated sizes are not those at the sample",
         False,
         _disagrees,
     ),
@@ -362,7 +362,8 @@ EXCHANGE: tuple[Entry, ...] = (
     ),
     Entry(
         "process/acquisition/flat_fields/flat_exposure_time",
-        "exposure time of flats, if different_flat_exposure says that it differs (default unit: seconds)",
+        "exposure time of flats, if different_flat_exposure says that the flats have another exposure time (default "
+        "unit: seconds)",
         units=EXCHANGE_TIME_UNITS,
     ),
     Entry(

@@ -161,8 +161,8 @@ def choose(file: h5py.File, detectors: list[Places], data: str | None = None) ->
     )
     first_data = detectors[0].data.name
     raise DataError(
-        f"{file.filename} has several detectors with frames, and no attribute `default` names one of them: {names}. "
-        f"Choose one: --data-path {first_data}."
+        f"{file.filename} has several detectors with frames, and no attribute `default` names one of these "
+        f"detectors: {names}. Choose one detector: --data-path {first_data}."
     )
 
 

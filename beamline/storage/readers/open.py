@@ -289,7 +289,9 @@ def _refuse(options: SourceOptions, follow: bool) -> None:
         )
     for one, other in (("angles", "angles_path"), ("darks", "darks_path"), ("flats", "flats_path")):
         if getattr(options, one) is not None and getattr(options, other) is not None:
-            raise DataError(f"--{one} and --{other.replace('_', '-')} state the same thing. Give only one of them.")
+            raise DataError(
+                f"--{one} and --{other.replace('_', '-')} state the same thing. Give only one of these options."
+            )
     for name, needed in (("darks_path", "data_path"), ("flats_path", "data_path"), ("angles_unit", "angles_path")):
         of_angles = name == "angles_unit" and isinstance(options.angles, Path | str)
         if getattr(options, name) is not None and getattr(options, needed) is None and not of_angles:

@@ -20,7 +20,7 @@ _EQUAL, _FEW = 1e-3, 4  # degrees between projections that count as one directio
 _FALSE_ALARM = 1e-3  # share of scans with random angles that may be reported
 # standard deviation of random gaps, without the largest gap, divided by their mean
 _OF_MEAN = 0.8
-_COUNTED = " The values are 0, 1, 2 and so on: are they frame numbers?"
+_COUNTED = " The values are 0, 1, 2 and so on: are these values frame numbers?"
 _LISTED = 20  # most groups of frames that a sentence lists
 _MANY = 30  # number of projections: a smaller scan within 6.28 degrees may be a test, and is not reported as radians
 

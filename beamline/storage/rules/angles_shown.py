@@ -272,13 +272,13 @@ def _angles_finding(scan: ScanEvidence, degrees: NDArray[np.float64], turn: _Tur
     known = [factor for factor in _FACTORS if abs(turn.degrees - 180 * factor) < np.ptp(degrees) / VIEWS]
     counted = np.allclose(degrees, np.arange(degrees.size))
     if counted:
-        unit = "the values are 0, 1, 2 and so on, so they are frame numbers"
+        unit = "the values are 0, 1, 2 and so on, so these values are frame numbers"
     else:
         times = 180 / turn.degrees
         unit = f"the angles look {times:.3g} times as large as stated"
     pairs = (
-        f"Frames {turn.alike[0]} and {turn.alike[1]} are mirror images, as projections 180 degrees apart "
-        f"are, but they are stated {turn.degrees:.4g} degrees apart"
+        f"Frames {turn.alike[0]} and {turn.alike[1]} are mirror images, as projections 180 degrees apart are, but "
+        f"the stated angles are {turn.degrees:.4g} degrees apart"
     )
     if turn.stated is not None:
         pairs += f"; frames {turn.stated[0]} and {turn.stated[1]}, stated 180 degrees apart, are not mirror images"

@@ -95,11 +95,11 @@ def views_scaled(scan: ScanEvidence) -> Iterator[Finding]:
     yield Finding(
         "error",
         "light",
-        "Use the images as the camera wrote them, or scale all of them by one factor. Here each image seems to be "
-        "scaled by a factor of its own, as some programs do when they save pictures. The same grey value then means "
-        f"a different attenuation in each projection. The pixels show this: in each of {VIEWS} projections checked, "
-        f"the "
-        f"darkest pixel is {low:g} and the brightest {high:g}, but in each projection these are different pixels.",
+        "Use the images as the camera wrote them, or scale all images by the same factor. Here each image seems to "
+        "be scaled by a factor of its own, as some programs do when they save pictures. The same grey value then "
+        f"means a different attenuation in each projection. The pixels show this: in each of {VIEWS} projections "
+        f"checked, the darkest pixel is {low:g} and the brightest {high:g}, but these pixels are at different places "
+        "in each projection.",
     )
 
 

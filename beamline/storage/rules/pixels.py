@@ -85,8 +85,8 @@ def darks_computed(scan: ScanEvidence) -> str:
     """
     darks = sample(scan, FrameKind.DARK) if scan.source.dtype.kind in "ui" else None
     return "" if darks is None or darks.min() < darks.max() else (
-        f"The darks are {darks.min():g} in every pixel checked: a constant, not what the camera measures "
-            "without beam. If darks were taken, give them with --darks."
+        f"The darks are {darks.min():g} in every pixel checked: a constant, not what the camera measures without "
+        "beam. If darks were taken, give these darks with --darks."
     )  # fmt: skip
 
 

@@ -168,7 +168,7 @@ def parts_joined(scan: ScanEvidence) -> Iterator[Finding]:
         sentence += f": {to_join(run_of(scan.source.path.resolve().parent))}"
     else:
         return
-    yield Finding("error", "parts", f"{sentence}. To use only this part, copy it out of the folder of its run.")
+    yield Finding("error", "parts", f"{sentence}. To use only this part, copy the file out of the folder of its run.")
 
 
 @dataclass(frozen=True)
@@ -193,8 +193,8 @@ RULES: tuple[Rule, ...] = (
     )),
     Row("error", "angles", angles_unknown),
     Row("warning", "angles", lambda scan: (where := scan.source.attributes.get("angles_reversed")) and (
-        f"The angles of {where} are used with the opposite sign, because the vector of their axis is negative. "
-        f"--angles-path {where} uses them as stored; the volume is then mirrored."
+        f"The angles of {where} are used with the opposite sign, because the vector of the rotation axis is "
+        f"negative. --angles-path {where} uses the angles as stored; the volume is then mirrored."
     )),
     angles_spread,
     angles_shown,
@@ -207,14 +207,14 @@ RULES: tuple[Rule, ...] = (
     one_intensity,
     pixels_measured,
     Row("warning", "pixels", lambda scan: (wrong := scan.source.attributes.get("pixels")) and (
-        f"The type of the pixels is stated wrongly or not at all: they are {wrong}."
+        f"The type of the pixels is stated wrongly or not at all: the pixels are {wrong}."
     )),
     views_scaled,
     axis_vertical,
     views_first,
     sinogram_assumed,
     Row("warning", "missing-frames", lambda scan: (n := scan.source.attributes.get("missing_triggers")) and (
-        f"{n} triggers gave no frame; the file lists them."
+        f"{n} triggers gave no frame; the file lists these triggers."
     )),
     Row("warning", "missing-frames", lambda scan: (numbers := scan.source.attributes.get("missing_numbers")) and (
         f"The series of files leaves out the numbers {numbers}."

@@ -100,11 +100,12 @@ def views_first(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "axis",
-            f"Check whether the {views.size} images are sinograms instead of projections: they look like sinograms. "
-            "All rows of an image have the same total absorption. The centre of the absorption follows a sine of the "
-            f"angle from row to row of an image (a sine explains {along_rows:.0%} of its changes), but not from image "
-            f"to image ({along_frames:.0%}). If they are sinograms, the first dimension counts detector rows: give "
-            "--order row,view,col, or set the attribute axes of the dataset in the file (y:theta:x).",
+            f"Check whether the {views.size} images are sinograms instead of projections, because the images look "
+            "like sinograms. All rows of an image have the same total absorption. The centre of the absorption "
+            f"follows a sine of the angle from row to row of an image (a sine explains {along_rows:.0%} of its "
+            f"changes), but not from image to image ({along_frames:.0%}). If the images are sinograms, the first "
+            "dimension counts detector rows: give --order row,view,col, or set the attribute axes of the dataset in "
+            "the file (y:theta:x).",
         )
 
 

@@ -171,7 +171,9 @@ class Nrrd:
             require_held(shape, dtype, begin, path.stat().st_size)
             values = np.memmap(path, dtype, "r", begin, shape)
         except (KeyError, ValueError, OSError) as error:
-            raise DataError(f"{path} cannot be read as a volume ({error}): it is cut off or was changed.") from error
+            raise DataError(
+                f"{path} cannot be read as a volume ({error}): the file is cut off or was changed."
+            ) from error
         yield record_of(path, facts, values)
 
 
@@ -222,7 +224,7 @@ def format_of(path: Path) -> VolumeFormat:
     """
     suffix = path.suffix.lower()
     if not path.name or (not suffix and path.name.startswith(".")):
-        raise ValueError(f"{str(path)!r} is not the name of a volume; expected one such as volume.h5.")
+        raise ValueError(f"{str(path)!r} is not the name of a volume; expected a name such as volume.h5.")
     kind_of_file = next((kind for kind in formats() if suffix in kind.suffixes), None)
     if kind_of_file is None:
         known = ", ".join(f"{' '.join(kind.suffixes) or 'no suffix'} ({kind.name})" for kind in formats())

@@ -174,6 +174,6 @@ class SwmrFile:
         with suppress(OSError):  # the folder may have been moved
             free = f"; {size(shutil.disk_usage(self._path.parent).free)} are free on its disk"
         return DataError(
-            f"Could not {what} {self._path} ({hdf5.reason(error)}){free}. The first {self.safe} frames are "
-            "safe in this file: run `beamline recover` to make an ordinary scan file of them."
+            f"Could not {what} {self._path} ({hdf5.reason(error)}){free}. The first {self.safe} frames are safe in "
+            "this file: run `beamline recover` to make an ordinary scan file of these frames."
         )

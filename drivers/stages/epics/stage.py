@@ -154,7 +154,8 @@ class EpicsStage(LineStage):
             if refused.value:
                 raise DeviceRefused(
                     self.name,
-                    f"the record rejected {self._travel.degrees(target)}, which is beyond its own limits (LVIO)",
+                    f"the record rejected {self._travel.degrees(target)}, which is beyond the limits of the record "
+                    "(LVIO)",
                     request=self._last,
                     advice="Compare HLM and LLM of the record with low_deg and high_deg",
                     state="Nothing has moved",

@@ -139,7 +139,10 @@ class PiGcsSettings(Wiring, StageFigures):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.pulse_width is not None:
-            raise ValueError("pulse_width_s cannot be set: the firmware of a pi_gcs controller fixes it; set null")
+            raise ValueError(
+                "pulse_width_s cannot be set: the firmware of a pi_gcs controller fixes the pulse "
+                "width; set pulse_width_s to null"
+            )
         self.limits()
 
     @property

@@ -95,7 +95,10 @@ class PM16CLine:
 COUNT = r"([+-]\d{7,10})"
 STATUS_SINCE = (1, 47)  # Firmware
 ENDINGS = {0x80: "emergency stop", 0x40: "stop command", 0x20: "limit", 0x10: "error"}
-ERRORS = {0x2: "a move was rejected because its pulse chip was busy", 0x4: "a move to a wrong position was rejected"}
+ERRORS = {
+    0x2: "a move was rejected because the pulse chip was busy",
+    0x4: "a move to an impossible position was rejected",
+}
 """Error flags about the motor.
 
 The flag for an unknown command is left out, because the empty line at every opening sets it.

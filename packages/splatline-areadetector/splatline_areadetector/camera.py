@@ -54,7 +54,9 @@ class AreaDetectorSettings:
     bits: int = setting(16, "Bits of a pixel.", ge=8, le=16)
     offset: float = setting(0.0, "Counts without beam.", ge=0, le=65535)
     ring: int = setting(2_000, "Memory for frames that wait for the disk.", unit="mb", ge=1, le=1_000_000)
-    timeout: float = setting(5.0, "Longest wait for an answer of the IOC.", unit="s", gt=0, le=100)
+    timeout: float = setting(
+        5.0, "Longest time in s that the driver waits for an answer of the IOC.", unit="s", gt=0, le=100
+    )
 
 
 class AreaDetectorCamera:

@@ -82,4 +82,4 @@ def test_a_port_that_cannot_be_is_refused(port: str, good: bool) -> None:
     assert (port_problem(port) == "") is good
     if not good:
         result = run(DEMO, "--set", f"devices.stage.port={port}")
-        assert result.exit_code == 2 and "is not a port; expected one such as COM3" in result.stderr
+        assert result.exit_code == 2 and "is not a port; expected a port such as COM3" in result.stderr

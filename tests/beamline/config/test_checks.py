@@ -72,7 +72,10 @@ def test_a_level_trigger_exposes_for_the_length_of_the_pulse() -> None:
 def test_what_a_controller_cannot_is_refused_at_once(tmp_path: Path) -> None:
     for stage, message in (
         ("{kind: pm16c, port: 'sim://pm16c', active_high: false", "the PM16C's trigger output has one polarity"),
-        ("{kind: pi_gcs, port: 'sim://pi_gcs', pulse_width_s: 1.0e-3", "the firmware of a pi_gcs controller fixes it"),
+        (
+            "{kind: pi_gcs, port: 'sim://pi_gcs', pulse_width_s: 1.0e-3",
+            "the firmware of a pi_gcs controller fixes the pulse width",
+        ),
         ("{kind: zaber, port: 'sim://zaber', pulse_width_s: 1.5e-3", "a whole number of milliseconds"),
         (
             "{kind: zaber, port: 'sim://zaber', pulse_width_s: 1.0e-3, toggle: true",

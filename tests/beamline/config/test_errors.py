@@ -11,7 +11,7 @@ from tests.beamline.config_file import GOOD, faults, load
 FAULTS = {
     "former key": (
         ("sample: {name: test}", "sample: {name: test}\nrecon: {stop_when: null}"),
-        "my.yaml:2: recon.stop_when no longer exists; remove it. scan.decide: do with scan.target: {quality_db",
+        "my.yaml:2: recon.stop_when no longer exists; remove it. Use `scan.decide: do` with `scan.target: {quality_db",
     ),
     "decision": (
         ("exposure_s: 0.01", "exposure_s: 0.01\n  decide: perhaps"),
@@ -115,8 +115,8 @@ FAULTS = {
     ),
     "an output that the PM16C has not": (
         ("shutter: {kind: simulated}", "shutter: {kind: stage_output, output: 2}"),
-        "my.yaml:9: devices: shutter.kind: a pm16c stage has no digital output for a shutter; set it to manual, or use "
-        "the output of another controller (stage.kind pi_gcs or zaber)",
+        "my.yaml:9: devices: shutter.kind: a pm16c stage has no digital output for a shutter; set shutter.kind to "
+        "manual, or use the output of another controller (stage.kind pi_gcs or zaber)",
     ),
     "an electrometer that sees no simulated beam": (
         ("  shutter:", "  beam_monitor: {kind: electrometer, port: COM4}\n  shutter:"),

@@ -91,7 +91,7 @@ def test_a_cone_that_is_not_stated_is_told_and_parallel_rays_are_not() -> None:
         for sentence in told_of:
             assert (
                 "If the beam is a cone, give --cone SOD:SDD" in sentence
-                and "it is 0 degrees with the stated distances" in sentence
+                and "the stated distances give a fan angle of 0 degrees" in sentence
             )
 
 

@@ -56,7 +56,7 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
     names = [event.event for event in events]
     assert names[0] == "state"
     assert [event.data["state"] for event in events[:3]] == ["warming_up", "ready", "waiting"]
-    watch = f"open {tmp_path / 'recon.live.png'}: it shows slices from the eighth projection on"
+    watch = f"open {tmp_path / 'recon.live.png'}: the picture shows slices from the eighth projection on"
     assert watch in str(events[1].data["message"])
     assert '<a href="recon.live.png">' in (tmp_path / "report.html").read_text(encoding="utf-8")
     assert names.count("recon_started") == 1

@@ -125,9 +125,9 @@ def test_the_dry_run_counts_them() -> None:
     [
         (("scan.offset_views=4",), "set sample.diameter_mm"),
         ((*WIDE, "devices.sample_mover={kind: stage, in_deg: 1, out_deg: 12, stage: "
-          f"{{kind: epics, port: 'sim://epics', {COMMON}}}}}"), "set its kind to stage, and its mm_per_deg"),
+          f"{{kind: epics, port: 'sim://epics', {COMMON}}}}}"), "set devices.sample_mover.kind to stage"),
         (("scan.offset_views=4", "sample.diameter_mm=0.1"), "field of view of 0.184 mm shows all of a sample"),
-        ((*WIDE, motor(0.01)), r"for an offset of -0.3312 mm, -32.12 is beyond the limits of its stage, -20 ... 25"),
+        ((*WIDE, motor(0.01)), r"-0.3312 mm, -32.12 is beyond the limits of the stage of this device, -20"),
         (("scan.offset_views=4", "sample.diameter_mm=0"), "sample.diameter_mm"),
     ],
     ids=["no diameter", "no axis", "all in the field", "out of reach", "no size"],

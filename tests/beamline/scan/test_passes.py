@@ -233,7 +233,7 @@ def test_the_wide_views_after_enough_pause_and_end_as_those_of_any_scan(
     assert [frame.trigger for frame in frames_of(ran.folder / "scan.h5")[FIRST + sizes[0] :]] == [VIEWS]
     with open_for_resume(ran.folder) as series:
         assert series.in_words.endswith(
-            "planned; the offset projections and flats that are missing at its end are taken now"
+            "planned; the offset projections and flats that are missing at the end of the run are taken now"
         )
     assert "--resume" in next_step(ran.folder / "scan.h5")
 
@@ -302,7 +302,7 @@ def test_wide_views_that_are_missing_are_taken_also_where_no_references_follow(
     instrument.clock.sleep(1e4)
     with open_for_resume(ran.folder) as series:
         assert series.in_words.endswith(
-            "has all 12 projections; the offset projections that are missing at its end are taken now"
+            "has all 12 projections; the offset projections that are missing at the end of the run are taken now"
         )
         run_scan(series.config, series, instrument=instrument.connected())
     frames = frames_of(ran.folder / "joined.h5")

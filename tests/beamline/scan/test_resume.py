@@ -161,7 +161,9 @@ def test_a_stop_before_references_of_the_end_leaves_the_run_as_it_was(tmp_path: 
     run = ended_run(tmp_path, "aborted", at=FIRST + VIEWS)
     stop = StopRequest()
     with open_for_resume(run) as series:
-        assert series.in_words.endswith("has all 12 projections; the flats that are missing at its end are taken now")
+        assert series.in_words.endswith(
+            "has all 12 projections; the flats that are missing at the end of the run are taken now"
+        )
         with refused(BeamlineError):
             run_scan(
                 series.config, series, [lambda event: stop.stop() if event.event == "run_started" else None], stop,

@@ -202,7 +202,7 @@ def test_what_lives_is_neither_resumed_nor_recovered_and_what_is_recovered_is_in
     assert describe(run).state == "finishing"
     file.close()
     assert describe(run).state == "failed"  # by a process that ended without a word of how
-    with open_for_resume(run), pytest.raises(ConfigError, match="another process is continuing or recovering it"):
+    with open_for_resume(run), pytest.raises(ConfigError, match="another process is continuing or recovering this run"):
         assert describe(run).state == "preparing"
         recover_run(run)
     assert describe(run).state == "failed"

@@ -108,7 +108,10 @@ def test_nobody_is_told_to_continue_a_ride(tmp_path: Path) -> None:
             config.write("\nride: {image: pva://X:Pva1:Image}\n")
     died, stopped = (next_step(next((tmp_path / end).rglob("scan.h5"))) for end in ("killed", "stopped"))
     assert died.startswith("The process of the scan was killed: `beamline recover ") and "--resume" not in died
-    assert stopped == "The run ended early. It recorded the scan of another program, so it cannot be continued."
+    assert (
+        stopped
+        == "The run ended early. The run recorded the scan of another program, so `beamline` cannot continue it."
+    )
 
 
 def test_parts_that_are_not_joined_are_not_taken_for_the_scan(tmp_path: Path) -> None:

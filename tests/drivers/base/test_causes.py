@@ -28,7 +28,10 @@ LOADERS = {
     "{0}: invalid ELF header": ("not a library that can be loaded", "Check the file"),
     "{0}: file too short": ("not a library that can be loaded", "Check the file"),
     "[WinError 193] %1 is not a valid Win32 application": ("another processor", "for this processor"),
-    "Could not find module '{0}' (or one of its dependencies).": ("a library that it needs", "with all its parts"),
+    "Could not find module '{0}' (or one of its dependencies).": (
+        "a library on which this library depends",
+        "with all its parts",
+    ),
     "dlopen({0}, 10): Library not loaded: @rpath/libusb.dylib": ("needs @rpath/libusb.dylib", "@rpath/libusb.dylib"),
     "dlopen({0}, 10): (mach-o file, but is an incompatible architecture)": ("another processor", "for this processor"),
 }

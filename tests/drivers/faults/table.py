@@ -256,7 +256,7 @@ CAMERA: tuple[CameraFault, ...] = (
     CameraFault("ring overrun", LedgerError, "projections are missing"),
     CameraFault("triggers planned too fast", ConfigError, "set scan.period_s >="),
     CameraFault("triggers too fast", LedgerError, "triggers were ignored by the camera, which was not ready"),
-    CameraFault("slow link", LedgerError, "`beamline check --connect` tests its link"),
+    CameraFault("slow link", LedgerError, "`beamline check --connect` tests the link of the camera"),
 )
 
 

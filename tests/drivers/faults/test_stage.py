@@ -65,7 +65,7 @@ def test_a_trigger_cable_that_loses_or_picks_up_pulses(
     scanned = rig.scan(tmp_path)
     assert isinstance(scanned.error, LedgerError)
     assert row.words in str(scanned.error)
-    assert "Repeat the missing projections, or reconstruct without them" in str(scanned.error)
+    assert "Repeat the missing projections, or reconstruct without these projections" in str(scanned.error)
     assert [index - table.FIRST_VIEW for index in scanned.error.missing] == list(row.missing)
     assert_reported_once(scanned)
     assert_at_rest(rig, scanned)

@@ -202,8 +202,9 @@ def _clearly_seen(views: PreparedProjections) -> str:
     factor = 1 / evened
     return (
         "If the sample is of one material, give --hardening fit, because the projections show beam hardening. The "
-        f"correction for one material would raise line integrals of {highest:.3g} to {corrected:.3g}. It would make "
-        f"the total absorption of each row vary {factor:.2g} times less between projections. Nothing was corrected"
+        f"correction for one material would raise line integrals of {highest:.3g} to {corrected:.3g}. The correction "
+        f"would make the total absorption of each row vary {factor:.2g} times less between projections. Nothing was "
+        "corrected"
     )
 
 

@@ -57,9 +57,9 @@ class Calibrate:
     terms: tuple[str, ...] = option(
         "--calibrate",
         "none",
-        "Find geometry errors from the projections and correct them. Give one or more, separated by commas: "
-        "axis (column of the rotation axis), roll (tilt of the axis in the detector's plane), tilt (tilt of the "
-        "axis along the beam), shifts (of each projection), gains (pixel sensitivity). Projections are not "
+        "Find geometry errors from the projections and correct these errors. Give one or more parameters, separated "
+        "by commas: axis (column of the rotation axis), roll (tilt of the axis in the detector's plane), tilt (tilt "
+        "of the axis along the beam), shifts (of each projection), gains (pixel sensitivity). Projections are not "
         "resampled. A parameter changes only if the held-out projections agree better with the new value.",
         parse=_terms,
         metavar="LIST",
@@ -247,7 +247,7 @@ def without_learnt_gains(views: PreparedProjections, progress: Progress) -> Step
     values = {"learnt_gains_held_out_before": learnt.without, "learnt_gains_held_out_after": learnt.with_gains}
     judged = (
         f"the residual in held-out projections is {learnt.without:.4g} without the correction and "
-        f"{learnt.with_gains:.4g} with it"
+        f"{learnt.with_gains:.4g} with the correction"
     )
     if learnt.without == 0:
         judged = "the projections show no stripes that come from the detector"

@@ -305,7 +305,7 @@ def _open_scene(folder: Path) -> ScanSource:
         example = lost[0]
         raise DataError(
             f"{meta_file} lists {len(angles)} projections, but {len(lost)} of the files do not exist, such as "
-            f"{example}. Download them, or remove them from the list. Nothing was read."
+            f"{example}. Download these files, or remove them from the list. Nothing was read."
         )
     source = TiffSeriesSource(folder, listed=[*angles])
     source.format, source.quantity = "r2_gaussian_scene", "line_integrals"
@@ -325,8 +325,8 @@ def _open_scene(folder: Path) -> ScanSource:
 
 _MOVED = "the axis is searched for, and the central ray is assumed at the middle row; --axis sets the axis"
 _BESIDE = (
-    "a projection 180 degrees from the first, taken after the series. It is not used: the axis is found from "
-    "the series itself"
+    "a projection 180 degrees from the first, taken after the series. This projection is not used: the axis is "
+    "found from the series itself"
 )
 
 

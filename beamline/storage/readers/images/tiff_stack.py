@@ -58,7 +58,7 @@ class TiffStackSource(ScanSource):
         if complaints.messages:
             self._tif.close()
             complaint = complaints.messages[0]
-            raise DataError(f"{path} cannot be read completely: it is cut off or damaged ({complaint}).")
+            raise DataError(f"{path} cannot be read completely: the file is cut off or damaged ({complaint}).")
         self.table = FrameTable.of(np.full(n, FrameKind.PROJECTION))
         self.facts = {"pages": len(self._tif.pages), "bigtiff": "yes" if self._tif.is_bigtiff else "no"}
         self.not_used += offered(self)

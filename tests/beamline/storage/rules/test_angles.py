@@ -52,8 +52,8 @@ def turn(degrees: float, views: int, endpoint: bool = False) -> NDArray[np.float
 @pytest.mark.parametrize(
     ("true", "stated", "unit"),
     [
-        (turn(180, 240), np.arange(240.0), "the values are 0, 1, 2 and so on, so they are frame numbers"),
-        (turn(180, 90), np.arange(90.0), "the values are 0, 1, 2 and so on, so they are frame numbers"),
+        (turn(180, 240), np.arange(240.0), "the values are 0, 1, 2 and so on, so these values are frame numbers"),
+        (turn(180, 90), np.arange(90.0), "the values are 0, 1, 2 and so on, so these values are frame numbers"),
         (turn(180, 120), turn(360, 120), "times as large as stated"),
     ],
 )
@@ -137,4 +137,4 @@ def test_views_that_count_up_are_asked_about_unless_a_plan_of_ours_states_them()
     (asked,) = angles_spread(ScanEvidence(source))
     source.plan = {"angles_deg": np.arange(180.0)}
     (known,) = angles_spread(ScanEvidence(source))
-    assert "are they frame numbers?" in asked.message and "count" not in known.message
+    assert "are these values frame numbers?" in asked.message and "count" not in known.message

@@ -182,7 +182,7 @@ DEGREES = np.arange(0, 180, 2.0)
 @pytest.mark.parametrize(
     ("theta", "said"),
     [
-        (DEGREES * 1000, "0 to 178000 degrees in steps of 2000, a whole turn or more. These look like"),
+        (DEGREES * 1000, "0 to 178000 degrees in steps of 2000, a whole turn or more. These values look like"),
         (-DEGREES * 1000 + 7e4, "-108000 to 70000 degrees in steps of 2000"),
         (DEGREES[np.random.default_rng(0).permutation(90)] * 1000, "look like counts of an encoder"),
         (DEGREES * 65536 / 360, "0 to 32403.9 degrees in steps of 364.1"),

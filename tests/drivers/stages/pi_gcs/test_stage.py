@@ -46,7 +46,7 @@ def test_errors_of_the_past_and_half_a_line_left_over_do_not_matter(rig: Rig) ->
         ({"max_speed": 0.0}, "max_speed is 0.0"),
         ({"max_speed": 1e-9}, "must be 1e-06 deg/s"),
         ({"acceleration": math.nan}, "acceleration is nan"),
-        ({"pulse_width": 1e-3}, "the firmware of a pi_gcs controller fixes it"),
+        ({"pulse_width": 1e-3}, "the firmware of a pi_gcs controller fixes the pulse width"),
         ({"first_pulse": "some time"}, "some time"),
     ],
 )

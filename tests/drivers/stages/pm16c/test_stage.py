@@ -143,7 +143,7 @@ def test_a_fifth_motor_cannot_start_and_the_controllers_words_are_given(rig: Rig
 
 @pytest.mark.parametrize(
     ("flag", "words"),
-    [(2, "its pulse chip was busy"), (4, "a wrong position was rejected"), (6, "busy and a move to a wrong")],
+    [(2, "the pulse chip was busy"), (4, "an impossible position was rejected"), (6, "busy and a move to an")],
 )
 def test_error_flags_of_the_past_are_in_the_description(flag: int, words: str) -> None:
     rig = Rig()

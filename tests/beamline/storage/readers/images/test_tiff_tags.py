@@ -108,7 +108,7 @@ def test_a_file_of_an_ome_set_has_its_own_pages_alone(tmp_path: Path, stack: NDA
         np.testing.assert_array_equal(source.read(slice(None)), stack)
         assert source.not_used == () or pages > 1
     if pages > 1:
-        with pytest.raises(DataError, match=rf"others contain {N - pages} images: add them with --append FILE"):
+        with pytest.raises(DataError, match=rf"other files contain {N - pages} images: add the other files with"):
             open_scan(SourceOptions(tmp_path / names[0], angles=np.arange(N + 1.0)))
 
 
