@@ -42,8 +42,8 @@ def read_model(path: Path) -> Model:
         if not arrays:
             raise DataError(
                 f"{path} contains no Gaussians: {record.parameters.get('method', 'its method')} does not use "
-                f"Gaussians, or the volume was made in slabs. Expected a volume of r2 made at once. Nothing was "
-                f"written."
+                "Gaussians, or the volume was made in slabs. Expected a volume that r2 made in one piece. Nothing "
+                "was written."
             )
         rows, cols = (int(n) for n in arrays["detector_shape"])
         sod, sdd = (float(d) for d in arrays["source_distances"])

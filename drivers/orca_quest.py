@@ -233,7 +233,8 @@ class DcamOptions(CheckedSettings):
     )
     hot_pixels: HotPixelMode | None = setting(
         None,
-        "null: counts as measured. Otherwise the camera repairs defects with this sensitivity, which alters data.",
+        "null: counts as measured. With a value, the camera repairs defective pixels with this sensitivity, which "
+        "alters the data.",
     )
     exposure_tolerance: float = setting(
         0.01,

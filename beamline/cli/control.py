@@ -140,9 +140,9 @@ stop = _command(
 )
 abort = _command(
     "abort",
-    "Abort a running scan at once, from another terminal, as the second Ctrl-C does.\n\n\b\n"
-    "beamline abort        the only running scan in ./runs\nbeamline abort RUN    the scan in the folder RUN\n\n"
-    "No further frame is taken. The scan file is readable, and `beamline scan --resume RUN` can continue the run.",
+    "Abort a running scan immediately, from another terminal, as the second Ctrl-C does.\n\n\b\nbeamline abort      "
+    "  the only running scan in ./runs\nbeamline abort RUN    the scan in the folder RUN\n\nNo further frame is "
+    "taken. The scan file is readable, and `beamline scan --resume RUN` can continue the run.",
 )
 
 

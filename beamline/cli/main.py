@@ -67,7 +67,7 @@ CORE = {
     ),
     "resume": CommandEntry("beamline.cli.control", "Continue a paused scan (from another terminal)."),
     "stop": CommandEntry("beamline.cli.control", "Stop a running scan cleanly (from another terminal)."),
-    "abort": CommandEntry("beamline.cli.control", "Abort a running scan at once (from another terminal)."),
+    "abort": CommandEntry("beamline.cli.control", "Abort a running scan immediately (from another terminal)."),
     "decide": CommandEntry(
         "beamline.cli.control", "Tell a scan that waits for your decision what to measure next (from another terminal)."
     ),

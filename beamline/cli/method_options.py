@@ -107,8 +107,8 @@ def _instead(name: str, owners: Mapping[str, Sequence[str]]) -> str:
         return "add --method with one of these methods."
     second = others[-1]
     return (
-        f"--{second} works only with {', '.join(owners[others[-1]])}. No method has both options: leave one of them "
-        "out."
+        f"--{second} works only with {', '.join(owners[others[-1]])}. No method has both options: leave out one of "
+        "the two options."
     )
 
 
@@ -226,7 +226,7 @@ _WITH_REFERENCE = option(
     help="Earlier volume of the same sample, or an earlier scan of the sample, which is then reconstructed first. "
     "The motion of the sample since the earlier scan, and the grey level of each particle, are estimated from "
     "the projections. Held-out projections decide whether the earlier volume is used. If the earlier volume is "
-    "not used, the result is that of auto.",
+    "not used, the method is chosen as with auto.",
 )
 _IN_TIME = together(
     option(

@@ -187,9 +187,9 @@ recon_options = together(
         excludes=EXCLUDED["roi"],
         metavar="Z0:Z1,Y0:Y1,X0:X1|auto",
         callback=parsed(region_of),
-        help="Write only this box of voxels; the indices are those of the full volume. Only detector rows that see "
-        "the box are used. fbp computes only these voxels; other methods compute full slices and crop the "
-        "slices. auto: the box around the sample, found in binned projections. Default: all voxels.",
+        help="Write only this box of voxels; the indices count the voxels of the full volume. Only detector rows "
+        "that see the box are used. fbp computes only these voxels; other methods compute full slices and crop "
+        "the slices. auto: the box around the sample, found in binned projections. Default: all voxels.",
     ),
     option(
         "--write-config",

@@ -115,7 +115,7 @@ scan_options = together(
         multiple=True,
         type=_PATH,
         metavar="FILE",
-        help="Another file of the same scan; its frames follow those of FILE. Can be given several times.",
+        help="Another file of the same scan; its frames follow the frames of FILE. Can be given several times.",
     ),
     option(
         "--scanner-file",
@@ -291,7 +291,8 @@ _BEFORE = (
         type=WholeRange(min=1),
         default=1,
         show_default=True,
-        help="Average blocks of N x N pixels. This reduces noise, memory and time, and makes voxels N times as large.",
+        help="Average blocks of N x N pixels. Binning reduces noise, memory and time, and makes voxels N times as "
+        "large.",
     ),
     option(
         "--axis",
@@ -317,8 +318,8 @@ _AFTER = (
         "--frames-per-view",
         type=WholeRange(min=1),
         metavar="N",
-        help="Average N successive projections, for example those that a step scan takes at one angle. 1: no "
-        "averaging. Default: the number in the scan file.",
+        help="Average N successive projections, for example the projections that a step scan takes at one angle. 1: "
+        "no averaging. Default: the number in the scan file.",
     ),
     option(
         "--pixel-size-um",

@@ -195,7 +195,9 @@ class StageOutputShutter(Section):
     set."""
 
     kind: Literal["stage_output"]
-    output: int = setting(doc="Number of the output. The output must not be that of the trigger pulses.", gt=0)
+    output: int = setting(
+        doc="Number of the digital output that moves the blade. The output of the trigger pulses cannot be used.", gt=0
+    )
     open_high: bool = setting(True, "true: a high output opens the shutter.")
     settle_s: float = setting(0.1, "Time in s that the blade needs to open or close.", ge=0)
 

@@ -75,8 +75,8 @@ class _Orca(Section):
     model: Literal["C15550-20UP", "C15550-22UP"] = setting(
         "C15550-20UP",
         "Model of the camera: C15550-20UP is the ORCA-Quest, C15550-22UP the ORCA-Quest 2. The readout ultra_quiet "
-        "of the ORCA-Quest 2 is five times as fast as that of the ORCA-Quest. Plans and simulations use the timing "
-        "of this model.",
+        "is five times as fast in the ORCA-Quest 2 as in the ORCA-Quest. Plans and simulations use the timing of "
+        "this model.",
     )
     roi: Roi | None = setting(None, "null: the full sensor, 2304 x 4096.")
     binning: Literal[1, 2, 4] = 1

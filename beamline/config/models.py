@@ -188,15 +188,15 @@ class ScanSection(Section):
     )
     energies: tuple[Kev, ...] | None = setting(
         None,
-        "Energies in keV of a series: one scan at each energy, one after the other. The start angle of each scan is "
-        "larger than that of the scan before, by a fraction of an angular step.",
+        "Energies in keV of a series: one scan at each energy, one after the other. Each scan starts at a larger "
+        "angle than the scan before, by a fraction of an angular step.",
         min_length=2,
         max_length=1000,
     )
     states: StatesSection | None = setting(
         None,
-        "A series of states of a sample that changes: one scan of each state, all in one folder. The start angle of "
-        "each scan is larger than that of the scan before, by a fraction of an angular step. null: one scan.",
+        "A series of states of a sample that changes: one scan of each state, all in one folder. Each scan starts "
+        "at a larger angle than the scan before, by a fraction of an angular step. null: one scan.",
     )
     state: int | None = setting(
         None, "Number of this scan in a series of states, counted from 1. The program sets this number.", ge=1, le=1000
@@ -269,7 +269,7 @@ class StorageSection(Section):
     flush_every: int = setting(
         16,
         "Largest number of frames that are flushed to the file together if frames wait to be written. If no frame "
-        "waits, each frame is flushed at once.",
+        "waits, each frame is flushed immediately.",
         gt=0,
         le=1_000_000,
     )
@@ -377,8 +377,8 @@ class Config(Section):
         n = self.scan.frames_per_view
         if n > 1 and self.scan.mode is Mode.FLY:
             raise ValueError(
-                f"scan.frames_per_view {n}: each frame of a fly scan has its own angle. Set scan.mode to "
-                "step, or plan more projections, which collect as many photons"
+                f"scan.frames_per_view {n}: each frame of a fly scan has its own angle. Set scan.mode to step, or "
+                "plan more projections, which collect the same number of photons in total"
             )
         if n > 1 and self.monitor.retake:
             raise ValueError(
@@ -391,9 +391,9 @@ class Config(Section):
     def _energy_can_be_set(self) -> Self:
         energy, several = self.scan.energy, self.scan.energies
         if energy is not None and several is not None:
-            raise ValueError("scan.energy and scan.energies exclude each other; give one of them")
+            raise ValueError("scan.energy and scan.energies exclude each other; give only one of the two keys")
         if several is not None and self.scan.states is not None:
-            raise ValueError("scan.energies and scan.states exclude each other; give one of them")
+            raise ValueError("scan.energies and scan.states exclude each other; give only one of the two keys")
         if self.scan.state is not None and self.scan.state > (self.scan.states.count if self.scan.states else 0):
             raise ValueError(
                 f"scan.state {self.scan.state} is larger than the number of states in scan.states; leave out "

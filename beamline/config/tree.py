@@ -211,7 +211,10 @@ def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
             "this line is indented deeper than the one above, which already has a value",
         ),
         (of_key, "a colon is missing after a key of this line or the one above"),
-        ("<block end>" in problem, "the indentation of this line does not match that of any group above this line"),
+        (
+            "<block end>" in problem,
+            "the indentation of this line does not match the indentation of any group above this line",
+        ),
     )
     at = context if (is_open or is_quote) and context else mark
     return at.line + 1, next((sentence for holds, sentence in faults if holds), problem)

@@ -82,9 +82,8 @@ def installation_problem(error: BaseException) -> str:
         advice = f"{sys.executable} does not find this library. Install it: pip install {package}"
     elif name in sys.stdlib_module_names or not _installed(origin):
         advice = (
-            f"Python finds a library of this name at {origin}. If this is a different package, {_way_out(origin)}; "
-            f"otherwise install "
-            "it again"
+            f"Python finds a library of this name at {origin}. If the library there is a different package, "
+            f"{_way_out(origin)}; otherwise install the library again"
         )
     else:
         advice = f"The library is at {origin}. Install it again: pip install --force-reinstall {package}"

@@ -103,8 +103,8 @@ def with_points(numbers: Sequence[str]) -> list[str]:
         with_point = f" beside {one_line(points[0], 40)} with a point" if points and points[0] != commas[0] else ""
         first_line = one_line(commas[0], 40)
         raise ValueError(
-            f"{first_line} has a comma{with_point}, and it is not clear whether this is a decimal comma: write one "
-            "number on a line, with a decimal point"
+            f"{first_line} has a comma{with_point}, and it is not clear whether this comma separates decimals: write "
+            "one number on a line, with a decimal point"
         )
     return [text.replace(",", ".") for text in numbers]
 

@@ -165,7 +165,8 @@ class MassCheck(Logged):
     bit: ClassVar[int] = 5
     unit: ClassVar[str] = "relative change"
     meaning: ClassVar[str] = (
-        "the total absorption differs from that of the first projections, in several projections in a row"
+        "the total absorption of several projections in a row differs from the total absorption of the first "
+        "projections"
     )
 
     warn: float = setting(

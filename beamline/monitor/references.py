@@ -206,9 +206,8 @@ def _without_beam(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFr
         if intensity <= limit * noise:
             yield BadFrames(group, intensity / noise if noise else 0.0, limit, (
                 "these flats show no beam. Was the shutter open for the flats, and closed for the darks? The level "
-                "of these "
-                f"flats, {level(group):.6g}, is {intensity:.3g} above that of the darks, {level(darks):.6g}; the noise "
-                f"of a pixel is {noise:.2g} (limit: {limit:g} times the noise)."
+                f"of these flats, {level(group):.6g}, is {intensity:.3g} above the level of the darks, "
+                f"{level(darks):.6g}; the noise of a pixel is {noise:.2g} (limit: {limit:g} times the noise)."
             ))  # fmt: skip
 
 
@@ -296,9 +295,9 @@ def _beam_in_darks(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadF
         unsure = known and noise < READOUT and level(flats) - level(darks) < FEW * noise
         if min(share, variance) > limit and level(darks) > 0 and not unsure:
             yield BadFrames(darks, min(share, variance), limit, (
-                "these darks were exposed to the beam. Was the shutter closed for the darks, and open for the flats? "
-                "The "
-                f"level of these darks, {level(darks):.6g}, is {share:.0%} of that of the flats, {level(flats):.6g}"
+                "these darks were exposed to the beam. Was the shutter closed for the darks, and open for the "
+                f"flats? The level of these darks, {level(darks):.6g}, is {share:.0%} of the level of the flats, "
+                f"{level(flats):.6g}"
                 + (f", and the variance is {variance:.0%}" if known else "")
                 + f" (limit {limit:.0%})."
             ))  # fmt: skip

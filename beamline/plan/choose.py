@@ -98,8 +98,8 @@ def choose(
     """
     if target.quality_db is not None and remaining.at_most <= target.quality_db:
         return Choice.ENOUGH, (
-            f"the rest of the plan would improve the PSNR by {remaining.mean:.2f} dB ({remaining.low:.2f} to "
-            f"{remaining.high:.2f}); the target accepts a loss of {target.quality_db:g} dB"
+            f"the remaining projections of the plan would improve the PSNR by {remaining.mean:.2f} dB "
+            f"({remaining.low:.2f} to {remaining.high:.2f}); the target accepts a loss of {target.quality_db:g} dB"
         )
     excesses = {option: _excess(option, target, seconds, dose) for option in offered if option.gain > 0}
     allowed = [option for option, excess in excesses.items() if not excess]

@@ -239,7 +239,7 @@ def remarks(facts: PlanFacts) -> Iterator[str]:
         "darks",
         plan.darks,
         plan.exposure,
-        "hot pixels and dark current of these darks differ from those of the projections",
+        "these darks have other hot pixels and another dark current than the projections",
     )
 
 

@@ -258,7 +258,8 @@ def _steady(
         odd_frame = frames[outlier]
         what = (
             f"The whole frame {odd_frame} is brighter or darker than the frames at neighbouring angles: the median "
-            f"of its line integrals differs from theirs by {odd:.2f} more than is usual in this scan"
+            f"of its line integrals differs from the medians of those frames by {odd:.2f} more than other frames of "
+            "this scan do"
         )
     sentence = (
         f"{what}, and there is no air next to the sample to correct this. Intensity, exposure, energy or "

@@ -71,9 +71,9 @@ class Preparation:
     flat_fields: FlatFields = option(
         "--flat-fields",
         "groups",
-        "groups: the flat of a projection is interpolated between the mean flats before and after it. dynamic: "
-        "for a beam that moves, also add those variations of the flats that the projection shows (needs 4 flats "
-        "or more).",
+        "groups: the flat of a projection is interpolated between the mean flats before and after it. dynamic: for "
+        "a beam that moves, also add the variations of the flats, with weights that are fitted to each projection "
+        "(needs 4 flats or more).",
         choices=get_args(FlatFields),
     )
     ring_current: str = option(
@@ -124,7 +124,7 @@ class Preparation:
 
     @property
     def needs_finished(self) -> str:
-        sentence = "--flags judge needs a finished scan; the monitor checks a running scan anyway."
+        sentence = "--flags judge needs a finished scan, because the monitor already checks a scan that is running."
         return sentence if self.judged else ""
 
     def memory(self, part: ScanPart) -> StepMemory:

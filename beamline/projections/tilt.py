@@ -44,7 +44,7 @@ def warn_of_tilt(plan: ScanCorrectionPlan, frames: NDArray[np.int64], warn: Warn
         warn(
             "Give --tilt auto (or --tilt 0 if the axis is straight): the rotation axis seems to be tilted in the "
             f"detector's plane by {tilt_text(shown.tilt, shown.uncertainty)}, {offset_px:.1f} px over {rows} rows. "
-            "This doubles edges in the first and last slices."
+            "The tilt doubles edges in the first and last slices."
         )
 
 

@@ -259,11 +259,11 @@ def _doubts(
         unexplained_change = check.alone(moved, prepared.geometry)
         yield Picture(
             "Change since the reference",
-            "A slice of the moved reference, of this volume, and of their difference. Red: denser than before, blue: "
-            "less dense. Cracks and pores that opened are blue; at edges, thin pairs of red and blue are errors of the "
-            "motion. The last picture is FBP of the residual (the measured projections minus those of the moved "
-            "reference), blurred by a voxel and divided by its standard error. Beyond 4 and -4 the projections "
-            "themselves show a change." + _displaced(result, moved),
+            "A slice of the moved reference, of this volume, and of their difference. Red: denser than before, "
+            "blue: less dense. Cracks and pores that opened are blue; at edges, thin pairs of red and blue are "
+            "errors of the motion. The last picture is FBP of the residual (the measured projections minus the "
+            "forward projections of the moved reference), blurred by a voxel and divided by its standard error. "
+            "Beyond 4 and -4 the projections themselves show a change." + _displaced(result, moved),
             pictures.change(result.volume, result.change, unexplained_change, unit, kind),
         )
     if result.deviation is not None:
@@ -280,7 +280,7 @@ def _doubts(
             "Residual in the projections",
             "Filtered back-projection of the residual, divided by its noise. The picture should show even noise, "
             "with values seldom above 4 or below -4. An edge, crack or pore that is visible here is in the "
-            "projections, but not in the volume. Blue: the volume is too dense, red: not dense enough.",
+            "projections, but not in the volume. Blue: the volume is too dense. Red: the volume is not dense enough.",
             pictures.significance(
                 unexplained.significance[middle], result.volume.grid, unexplained.first + middle, unit
             ),
@@ -316,9 +316,9 @@ def _views(prepared: PreparedProjections) -> Iterator[Picture]:
     if axis is not None:
         yield Picture(
             "Rotation axis",
-            "How badly the projections fit together for each candidate column of the rotation axis "
-            f"({axis.method}): 0 if they agree, about 1 if they have nothing in common. Columns are those of the "
-            "binned detector.",
+            f"How badly the projections fit together for each candidate column of the rotation axis ({axis.method}): "
+            "0 if they agree, about 1 if they have nothing in common. The columns are columns of the binned "
+            "detector.",
             pictures.axis_curve(axis.candidates, axis.curve, axis.value, axis.confident),
         )
     turns = np.degrees(np.stack((geometry.roll, geometry.tilt), axis=1))

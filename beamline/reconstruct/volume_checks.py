@@ -159,9 +159,9 @@ def not_begun_warning(result: Reconstruction, judgement: Judgement) -> str:
     steps = f" after {last.step} of {last.steps} {last.unit or 'steps'}" if last is not None and last.steps else ""
     return (
         f"Allow more time, steps or iterations: the {label_of(result.method)} volume does not show the sample yet. "
-        f"The residual of this volume, {residual:.3g}, is not smaller than that of a uniform volume, {uniform:.3g} "
-        f"(both as a fraction of "
-        f"the variation along detector rows). The method ended after {result.seconds:.3g} s{steps}."
+        f"The residual of this volume, {residual:.3g}, is not smaller than the residual of a uniform volume, "
+        f"{uniform:.3g} (both as a fraction of the variation along detector rows). The method ended after "
+        f"{result.seconds:.3g} s{steps}."
     )
 
 
@@ -270,9 +270,9 @@ def _lost_material(result: Reconstruction, prepared: PreparedProjections, fbp: V
     z, y, x = (f"{first}:{end}" for first, end in lost.region)
     return (
         f"Weakly absorbing material is missing: in the region {z},{y},{x} [z, y, x] the {label_of(result.method)} "
-        f"volume has only {lost.kept_share:.0%} of the mass that FBP shows (measured from the air level of FBP). This "
-        "happens, for example, if the air level is below zero. Use --allow-negative or --method fbp, or correct the "
-        "air (--air, see docs/corrections.md)."
+        f"volume has only {lost.kept_share:.0%} of the mass that FBP shows (measured from the air level of FBP). One "
+        "possible cause is an air level below zero. Use --allow-negative or --method fbp, or correct the air "
+        "(--air, see docs/corrections.md)."
     )
 
 

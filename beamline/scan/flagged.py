@@ -128,8 +128,9 @@ class AlarmReaction:
 
     def _act(self, flag: Flag) -> None:
         n = self._in_a_row[flag.check]
-        frames = f"{n} consecutive frames have" if n > 1 else "1 frame has"
-        reason = f"{frames} an alarm of the monitor's {flag.check} check: {flag.advice.rstrip('.')}"
+        frames_have = f"{n} consecutive frames have" if n > 1 else "1 frame has"
+        advice = flag.advice.rstrip(".")
+        reason = f"{frames_have} an alarm of the check `{flag.check}` of the monitor: {advice}"
         match self._policies.get(flag.check, Policy.LOG):
             case Policy.WARN:
                 self._sink(Warned(f"{reason}."))

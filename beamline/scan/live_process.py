@@ -217,9 +217,9 @@ class LiveReconstruction:
         deadline = time.monotonic() + seconds
         if not self._ready.is_set():
             say(
-                "Waiting until the live reconstruction has compiled its kernels (1 to 2 minutes the "
-                f"first time on a computer, otherwise seconds; at most {seconds:.0f} s). A pause starts "
-                "after this wait; a stop ends the wait"
+                "Waiting until the live reconstruction has compiled its kernels (1 to 2 minutes the first time on a "
+                f"computer, later a few seconds; at most {seconds:.0f} s). A pause starts after this wait; a stop "
+                "ends the wait"
             )
         while self._process is not None and self._process.running and not stop():
             if self._ready.wait(_POLL):

@@ -101,8 +101,8 @@ class ReferenceLog:
             f"Expose for longer (scan.exposure_s={longer_exposure:.2g}, and scan.period_s to match), or bin the "
             "camera's pixels (devices.camera.binning): the beam is too weak. A pixel of the open beam has "
             f"{n_photons:.3g} photons per projection (from mean and variance of the flats {flat_frames}); expected "
-            f"{FEW_PHOTONS} or more, otherwise noise dominates the volume. `beamline tune` measures the photons per "
-            "pixel."
+            f"{FEW_PHOTONS} or more, because with fewer photons noise dominates the volume. `beamline tune` measures "
+            "the photons per pixel."
         )
 
 

@@ -133,15 +133,15 @@ def _of_block(taken: BlockTally) -> str:
                 "exposures (invalid rows)."
             )
         if taken.ignored:
-            text += f" {taken.ignored} triggers were ignored by the camera, which was not ready."
+            text += f" {taken.ignored} triggers gave no frame, because the camera was not ready and ignored them."
     if untriggered := taken.extra - taken.unconfirmed:
         text += f" {untriggered} frames came without a trigger and are kept as invalid rows."
     if taken.unconfirmed:
         text += (
-            f" {taken.unconfirmed} frames came while the stage braked, and are kept as invalid "
-            "rows. Their angles are not certain: neither the trigger times nor the final position of the "
-            "stage confirm them. Either the trigger line picks up noise, or the stage decelerates "
-            "differently from its configured value."
+            f" {taken.unconfirmed} frames came while the stage braked, and are kept as invalid rows. The angles of "
+            "these frames are not certain: neither the trigger times nor the final position of the stage confirm "
+            "the angles. Either the trigger line picks up noise, or the stage decelerates differently from its "
+            "configured value."
         )
     if taken.shift:
         text += (

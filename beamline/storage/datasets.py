@@ -298,9 +298,8 @@ def radians(item: h5py.Dataset, unit: str | None = None, default: str = "") -> N
     where = f"{item.name} in {item.file.filename}"
     angles, stated = _numbers(item)
     if angles is None:
-        raise DataError(
-            f"{where} contains {_SORTS.get(item.dtype.kind, item.dtype)}; expected integers or real numbers."
-        )
+        found = _SORTS.get(item.dtype.kind, item.dtype)
+        raise DataError(f"{where} contains {found}; expected integers or real numbers.")
     unit = unit or " and ".join(sorted(stated)) or default
     factor = factor_of(unit, ANGLE_UNITS)
     if factor is None:

@@ -92,7 +92,7 @@ def _no_run(folder: Path, wanted: str) -> Path:
         )
     if runs := sorted(log.parent for log in folder.glob(f"*/{EVENTS}")):
         newest = runs[-1]
-        raise DataError(f"{folder} contains several runs. Name one of them, such as {newest}.")
+        raise DataError(f"{folder} contains several runs. Name one of these runs, such as {newest}.")
     return folder
 
 

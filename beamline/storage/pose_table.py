@@ -286,8 +286,8 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
         moved[axis] = values - np.median(values[shown])
     if not moved:
         raise _NoPosesError(
-            f"{path} has none of sample/x_translation, y_translation and z_translation; expected at least "
-            "one of them, or a CSV"
+            f"{path} has none of sample/x_translation, y_translation and z_translation; expected at least one of "
+            "these fields, or a CSV file"
         )
     directions = ", ".join(f"{axis} by {np.ptp(values[shown]):.4g} mm" for axis, values in moved.items())
     if ways is None:

@@ -115,8 +115,8 @@ def plain_name(written: str) -> str:
     """
     if "%b" in written.replace("%%", ""):
         raise DataError(
-            f"A virtual dataset refers to a numbered series of files, {written}, which is not supported. "
-            "Copy its values to an ordinary dataset. Nothing was read."
+            f"A virtual dataset refers to a numbered series of files, {written}, which is not supported. Copy the "
+            "values to an ordinary dataset. Nothing was read."
         )
     return written.replace("%%", "%")
 

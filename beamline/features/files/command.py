@@ -84,7 +84,9 @@ def info(
     if (output is not None or light_request is not None) and not statistics:
         raise click.UsageError("-o and --photons-per-count work only with --statistics.")
     if statistics and (truth or masks):
-        raise click.UsageError("--statistics is for scans, --truth and --masks are for volumes: leave out one of them.")
+        raise click.UsageError(
+            "--statistics is for scans, --truth and --masks are for volumes: leave out the options that do not fit."
+        )
     if statistics:
         _print_statistics(SourceOptions(file, **scan_facts), output, light_request, as_json)
     elif truth or masks:

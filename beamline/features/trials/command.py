@@ -49,6 +49,10 @@ def listed(value: str) -> tuple[str, ...]:
     return wanted
 
 
+_ALL_METHODS = ", ".join(names_of_trials())
+_NOT_COMPARED = ", ".join(name for name in names_of_trials() if name not in names_compared())
+
+
 @dataclass(frozen=True, eq=False)
 class TradeoffRequest:
     """The arguments of `beamline tradeoff`."""
@@ -67,8 +71,7 @@ class TradeoffRequest:
         "--methods",
         callback=parsed(listed),
         metavar="A,B,...",
-        help=f"Methods to compare: some of {', '.join(names_of_trials())}. "
-        f"Default: all except {', '.join(name for name in names_of_trials() if name not in names_compared())}.",
+        help=f"Methods to compare: some of {_ALL_METHODS}. Default: all except {_NOT_COMPARED}.",
     )
     quick: bool = set_by(
         "--quick/--full",
@@ -153,8 +156,7 @@ class StudyRequest:
         show_default=True,
         metavar="NAME",
         help=(
-            f"Method with which every row of the table is reconstructed: {', '.join(names_of_trials())}. Can "
-            "be given several times."
+            f"Method with which every row of the table is reconstructed: {_ALL_METHODS}. Can be given several times."
         ),
     )
     truth: str | None = set_by(

@@ -50,7 +50,7 @@ _NO_SCORE = (
 _OTHER_VIEWS = (
     "Look at the pictures first. Each value of this option corrects the projections differently, and the score of a "
     "slice needs projections to compare with. Therefore each slice is compared with the projections of all values, "
-    "and its score is the mean. This favours values in the middle of the range."
+    "and its score is the mean. This mean favours values in the middle of the range."
 )
 
 

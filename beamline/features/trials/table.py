@@ -162,7 +162,7 @@ def _conclusions(table: TrialTable) -> list[str]:
     highest = max((o for o in table.compared if math.isfinite(o.quality(by))), key=lambda o: o.quality(by))
     if (gain := highest.quality(by) - best.quality(by)) >= LEAST_GAIN:
         chance = (
-            f"+{gain:.2f} dB with {highest.trial.label}, but this may be chance (± "
+            f"+{gain:.2f} dB with {highest.trial.label}, but the difference may be chance (± "
             f"{table.chance(highest, best):.2f} dB)."
         )
         out.append(f"No other trial is significantly better. The highest value: {chance}")

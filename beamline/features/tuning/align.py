@@ -133,7 +133,7 @@ class Alignment:
             if math.isnan(self.detail)
             else (
                 f"{self.detail:.3g} px is the width of the finest detail in the projection at {degrees(self.angle)}; "
-                "focus until this is smallest"
+                "focus until this width is smallest"
             )
         )
         return [f"{name:<8}{text}" for name, text in (("axis", axis), ("tilt", tilt), ("detail", detail))]
@@ -189,7 +189,7 @@ def evaluate(frames: Sequence[Frame], pixel_size: float) -> Alignment:
         raise QualityError(f"The two projections do not show the axis: {error}") from error
     if not axis.confident:
         raise QualityError(
-            f"The two projections do not match: the axis is perhaps near column {axis.value:.1f}, but this is "
+            f"The two projections do not match: the axis is perhaps near column {axis.value:.1f}, but this column is "
             "not certain. Use a sample with more contrast that stays in the field of view, and check the flats."
         )
     offset = axis.value - (dark.shape[1] - 1) / 2

@@ -84,7 +84,7 @@ class BandsCheck(Logged):
     bit: ClassVar[int] = 3
     unit: ClassVar[str] = "fraction of the intensity in the row or column"
     meaning: ClassVar[str] = (
-        "some rows or columns suddenly became darker or brighter, and the rest of the frame did not"
+        "some rows or columns suddenly became darker or brighter, and the rest of the frame did not change"
     )
 
     alarm: float = setting(
@@ -146,7 +146,7 @@ class BandsCheck(Logged):
         darker_or_brighter = "darker" if score > 0 else "brighter"
         advice = (
             f"Check the link and the readout of the camera, and the slits: {word} {first} ... {last} suddenly became "
-            f"up to {abs(score):.0%} {darker_or_brighter}, the rest of the frame did not. {AGAIN}"
+            f"up to {abs(score):.0%} {darker_or_brighter}, but the rest of the frame did not change. {AGAIN}"
         )
         return Flag(self.name, Level.ALARM, view, score, limit, advice, region)
 

@@ -112,7 +112,7 @@ class ZingersCheck(Logged):
             advice = (
                 f"Shield the detector against scattered and direct X-rays: this projection has {count(n, 'zinger')} "
                 "(bright spots that are in no other frame). `beamline recon` replaces zingers of up to 3 x 3 pixels "
-                "with their neighbours, but so many zingers hide too much of the sample."
+                "with their neighbours, but this number of zingers hides too much of the sample."
             )
             return CheckResult(state, Flag(self.name, Level.WARN, frame.index, score, self.warn, advice))
         if state.views != VIEWS or not state.zingers:

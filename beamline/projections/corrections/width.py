@@ -91,10 +91,9 @@ class Width:
     arc: str = option(
         "--exposure-arc",
         "auto",
-        "Rotation of the stage in degrees: ARC during an exposure, READOUT from the readout of the first "
-        "row to that of the last (negative: the last row is read first). auto: from the file of a fly "
-        "scan, if ARC is 1 px or more at the edge of the field of view. none: the stage does not turn during an "
-        "exposure.",
+        "Rotation of the stage in degrees: ARC during an exposure, READOUT between the readout of the first row and "
+        "the readout of the last row (negative: the last row is read first). auto: from the file of a fly scan, if "
+        "ARC is 1 px or more at the edge of the field of view. none: the stage does not turn during an exposure.",
         parse=_arc,
         metavar="auto|none|ARC[:READOUT]",
     )

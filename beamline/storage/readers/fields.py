@@ -185,8 +185,8 @@ NXTOMO: tuple[Entry, ...] = (
     ),
     Entry(
         "detector/y_pixel_size",
-        "height of a pixel. In a parallel beam, this is also the distance between slices; in other beams, pixels "
-        "must be square",
+        "height of a pixel. In a parallel beam, this height is also the distance between slices; in other beams, "
+        "pixels must be square",
         units=datasets.LENGTH_UNITS,
     ),
     Entry(
@@ -272,7 +272,7 @@ NXTOMO: tuple[Entry, ...] = (
     Entry("detector/y_pixel_offset", "pixels are assumed to be evenly spaced", False),
     Entry(
         "detector/magnification",
-        "pixel sizes are used as stated; give --pixel-size-um if the stated sizes are not those at the sample",
+        "pixel sizes are used as stated; give --pixel-size-um if these sizes are not valid at the sample",
         False,
         _disagrees,
     ),
@@ -353,7 +353,11 @@ EXCHANGE: tuple[Entry, ...] = (
     Entry("exchange/data_shift_y", _POSES, False, _shifts),
     Entry("exchange/x", "pixels are assumed to be evenly spaced; x_pixel_size is used", False),
     Entry("exchange/y", "pixels are assumed to be evenly spaced; y_pixel_size is used", False),
-    Entry("measurement/instrument/source/energy", "this is the energy of the ring, not of the photons", False),
+    Entry(
+        "measurement/instrument/source/energy",
+        "this field is the energy of the storage ring, not of the photons",
+        False,
+    ),
     Entry("measurement/instrument/source/current", "the file has only one value for the whole scan", False),
     Entry(
         "measurement/instrument/detector/exposure_time",

@@ -174,7 +174,7 @@ class NexusSource(ScanSource):
         self.not_used += stated_in(NXTOMO, self._places.entry, self, str(self._places.detector.name))
         for other in {str(each.data.name): each for each in detectors if each.data != self._places.data}.values():
             shape, where = " x ".join(map(str, other.data.shape)), str(other.data.name)
-            why = f"this is another scan in the file; --data-path {where} selects this scan"
+            why = f"these frames belong to another scan in the file; --data-path {where} selects this scan"
             self.not_used += (NotUsed(where, f"{shape} frames", why, True),)
         if turned:
             self.not_used += (NotUsed("detector/transformations", turned, UPRIGHT, True),)

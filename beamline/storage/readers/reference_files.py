@@ -162,7 +162,10 @@ def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: 
     wanted = "images" if shape is None else f"images of {shape[0]} x {shape[1]} pixels"
     option = f"--{kind.name.lower()}s"
     if candidates:
-        raise DataError(f"{path} contains several datasets of {wanted}: {shapes}. Name one: {option} FILE::DATASET.")
+        raise DataError(
+            f"{path} contains several datasets of {wanted}: {shapes}. Name one of these datasets: "
+            f"{option} FILE::DATASET."
+        )
     raise DataError(f"{path} contains no {wanted} for {option}" + (f"; it has {shapes}." if shapes else "."))
 
 

@@ -83,9 +83,9 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
             "warning",
             "angle-spread",
             f"Compare with --method fista-tv, because FBP leaves streaks: the {distinct.size} projections show only "
-            f"{n} directions, which is few for {n_cols} columns. With steps of {step:.4g} degrees many projections "
-            "are 180 degrees apart, and these measure the same rays. Next time, use a step that does not divide 180 "
-            "degrees.",
+            f"{n} directions, too few for {n_cols} columns. With steps of {step:.4g} degrees many projections are "
+            "180 degrees apart, and projections 180 degrees apart measure the same rays. Next time, use a step that "
+            "does not divide 180 degrees.",
         )
 
 

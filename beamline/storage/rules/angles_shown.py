@@ -363,7 +363,10 @@ def _in_another_order(seen: CoarseViews, jumps: NDArray[np.int64], far: Pair, ne
     single = np.intersect1d(jumps, jumps + 1)  # between two jumps of the angles
     if single.size and jumps.size == 2 * single.size and single.size <= _SINGLE * seen.rows.size:
         wrong = ", ".join(f"{row} ({seen.degrees[row]:.6g})" for row in seen.rows[single[:5]].tolist())
-        text += f"The angles of {single.size} projections are not between those of their neighbours: frames {wrong}. "
+        text += (
+            f"The angles of {single.size} projections are not between the angles of the neighbouring "
+            f"projections: frames {wrong}. "
+        )
         return Finding("warning", ORDER, text + "Give the right angles with --angles FILE (degrees, one per line).")
     text += (
         "The angles are not in the order of the frames. Give one angle for each projection, in the order of the "

@@ -160,9 +160,9 @@ def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "light",
-            "All darks are 0, but the flats vary like those of a camera. Darks of 0 are right if the darks were "
-            "already subtracted from the frames. Otherwise projections and flats include the camera's offset, which "
-            "makes line integrals too small: give --darks.",
+            "All darks are 0, but the flats vary like flats that a camera recorded. Darks of 0 are right if the "
+            "darks were already subtracted from the frames. Otherwise projections and flats include the camera's "
+            "offset, which makes line integrals too small: give --darks.",
         )
     lit = lit_places(flat - dark)
     if not lit.any():
@@ -284,8 +284,8 @@ def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
             "."
             if known
             else f". The exposure of the flats is not stated. {assumed_exposure:g} s is assumed, because no "
-            "projection is then brighter than the flats. If the sample fills the field of view, this may be a "
-            "wrong exposure. All line integrals are then wrong by the same amount."
+            "projection is then brighter than the flats. If the sample fills the field of view, this exposure "
+            "may be wrong. All line integrals are then wrong by the same amount."
         )
         yield Finding(
             "info" if known else "warning",

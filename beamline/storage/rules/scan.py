@@ -127,7 +127,8 @@ def pixels_square(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "error",
             "pixel-height",
-            f"The pixels are stated to be {height:g} mm high, and their width is {width_text}. This is impossible.",
+            f"The pixels are stated to be {height:g} mm high, and their width is {width_text}. Such pixels are "
+            "impossible.",
         )
     elif scan.cone is not None:
         yield Finding(

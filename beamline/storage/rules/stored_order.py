@@ -36,8 +36,8 @@ def axis_vertical(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "axis",
-            "The rotation axis seems to be horizontal; expected along the columns. Between projections, "
-            f"the total absorption of a row changes {ratio:.3g} times as much as that of a column. "
+            "The rotation axis seems to be horizontal; expected along the columns. Between projections, the total "
+            f"absorption of a row changes {ratio:.3g} times as much as the total absorption of a column. "
             f"{_exchanged(scan)}If the axis is horizontal, give --horizontal-axis.",
         )
 

@@ -17,7 +17,7 @@ NOT_ALLOWED_TO_MOVE = 5
 UNKNOWN_COMMAND = 2
 
 CHECK_MODEL = "Check that the controller belongs to the C-863 class and supports this command"
-CHECK_AXIS = "Check that the axis in the configuration is one of those that the command SAI? lists"
+CHECK_AXIS = "Check that the command SAI? lists the axis that the configuration names"
 CHECK_TRAVEL = "Compare the limits in the configuration with the controller's travel range (TMN?, TMX?)"
 CHECK_SPEED = "Compare max_speed and acceleration in the configuration with what the controller allows"
 HOME = "Search the reference first, and check that the servo is on"

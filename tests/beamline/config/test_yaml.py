@@ -111,7 +111,7 @@ FAULTS = {
     "between": (
         "scan:\n    mode: step\n  views: 3\n",
         3,
-        "the indentation of this line does not match that of any group above",
+        "the indentation of this line does not match the indentation of any group above",
     ),
     "at": ("sample:\n  name: @x\n", 2, "a value begins with '@'; put it in quotes"),
     "star": ("sample:\n  name: *x\n", 2, "text that begins with * or & needs quotes"),

@@ -91,7 +91,10 @@ def test_a_library_that_cannot_be_loaded_is_no_defect(
         assert each is not None and exit_code(each) == 2 and not is_defect(each)
     told = user_message(error)
     assert told.startswith("the library 'broken' cannot be loaded (") and why in told
-    assert f"Python finds a library of this name at {tmp_path / 'broken' / '__init__.py'}. If this is a" in told
+    assert (
+        f"Python finds a library of this name at {tmp_path / 'broken' / '__init__.py'}. If the library there is a"
+        in told
+    )
 
 
 def test_an_installed_library_is_installed_again_and_a_missing_one_installed(

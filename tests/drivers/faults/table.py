@@ -255,7 +255,7 @@ CAMERA: tuple[CameraFault, ...] = (
     CameraFault("frame lost in the camera", LedgerError, "were exposed but never delivered by the camera"),
     CameraFault("ring overrun", LedgerError, "projections are missing"),
     CameraFault("triggers planned too fast", ConfigError, "set scan.period_s >="),
-    CameraFault("triggers too fast", LedgerError, "triggers were ignored by the camera, which was not ready"),
+    CameraFault("triggers too fast", LedgerError, "triggers gave no frame, because the camera was not ready"),
     CameraFault("slow link", LedgerError, "`beamline check --connect` tests the link of the camera"),
 )
 

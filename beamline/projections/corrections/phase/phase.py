@@ -67,10 +67,10 @@ class Phase:
     material: str | None = option(
         "--phase",
         _AUTO,
-        "Phase retrieval from one distance (Paganin). X is the ratio delta/beta, or a material: a "
-        "chemical formula, or a material of the simulator. none: no filter. auto: a filter is applied only if the "
-        "outer edges of the sample show phase fringes. Held-out projections choose the length of the filter, which "
-        "otherwise follows from delta/beta and the distance.",
+        "Phase retrieval from one distance (Paganin). X is the ratio delta/beta, or a material: a chemical formula, "
+        "or a material of the simulator. none: no filter. auto: a filter is applied only if the outer edges of the "
+        "sample show phase fringes. With auto, held-out projections determine the length of the filter. With "
+        "paganin:X, the length follows from delta/beta and the distance.",
         parse=_material,
         metavar="auto|none|paganin:X",
     )

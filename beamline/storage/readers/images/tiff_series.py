@@ -254,8 +254,8 @@ def _open_zip(path: Path) -> zipfile.ZipFile:
 def _refuse_more(path: Path, n: int) -> None:
     if n > MOST_FILES:
         raise DataError(
-            f"{path} contains more than {MOST_FILES} files, which is too many for a scan. Give the folder of "
-            "its images."
+            f"{path} contains more than {MOST_FILES} files, which is too many for a scan. Give a folder that "
+            "contains only the images of the scan."
         )
 
 

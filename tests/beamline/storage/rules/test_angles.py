@@ -109,7 +109,12 @@ GOLDEN = np.arange(64) * 111.246
         (EVEN, EVEN[PASSES], "error", "not in the order of the frames"),
         (EVEN, EVEN[MIXED], "error", "not in the order of the frames"),
         (EVEN, np.r_[EVEN[:54], np.zeros(10)], "error", "not in the order of the frames"),
-        (EVEN, np.where(np.arange(64) == 40, 0, EVEN), "warning", "not between those of their neighbours: frames 48"),
+        (
+            EVEN,
+            np.where(np.arange(64) == 40, 0, EVEN),
+            "warning",
+            "not between the angles of the neighbouring projections",
+        ),
         (EVEN[PASSES], EVEN, "warning", "look more similar than neighbours"),
     ],
     ids=["shifted", "passes stated", "shuffled", "end not written", "one wrong", "passes taken"],
