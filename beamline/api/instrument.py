@@ -120,7 +120,7 @@ class Instrument:
             ScanStopped: Ctrl-C, `stop`, or a check of the monitor ended the scan; ScanAborted: the scan was aborted.
 
         After an error during the scan, the frames taken so far are in the file, which `last` names. If the scan ends
-        early because it has enough projections (`scan.decide`), no error is raised.
+        early because further projections would not improve the volume (`scan.decide`), no error is raised.
         """
         refuse_wrong_arguments(Instrument.scan, locals())
         if not self._one_at_a_time.acquire(blocking=False):

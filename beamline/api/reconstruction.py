@@ -172,8 +172,8 @@ def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
     scan file wait for each other, so that a slow reader slows the scan down.
 
     Args:
-        path: a scan file, or the folder of a run (its newest part). The scan file need not exist yet: the function
-            waits at most 120 s for it.
+        path: a scan file, or the folder of a run, from which the newest part is read. The scan file need not exist yet:
+            the function waits at most 120 s for it.
         follow: False: only the frames that are already in the file.
 
     Raises:
@@ -188,7 +188,7 @@ def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
 
 
 def volumes(run: str | Path) -> Iterator[Volume]:
-    """Iterate over the volumes of a run: the live volume after each update, and finally the finished volume. The
+    """Iterate over the volumes of a run: the live volume after each update, and at the end the finished volume. The
     iteration ends when the run ends.
 
     Args:

@@ -58,7 +58,7 @@ class Event:
 
     @property
     def data(self) -> dict[str, Any]:
-        """The values of the event by name, as they are written to JSON."""
+        """The values of the event by name, in the form that is written to JSON."""
         values: dict[str, Any] = {}
         own_fields = [each for each in fields(self) if each.name not in ("time", "source", "scan")]
         for each in (*own_fields, *(each for each in fields(Event) if each.name != "time")):

@@ -42,7 +42,7 @@ class ScanNeeds:
         return sum(self.parts.values())
 
     def data(self) -> dict[str, Any]:
-        """The values by name, as programs get them."""
+        """The values by name, in the form that other programs get."""
         return {"duration": self.duration, **vars(self), "operator": [each._asdict() for each in self.operator]}
 
 

@@ -73,7 +73,8 @@ class Selection:
         return next((step for step in self.steps if isinstance(step, kind)), None) or kind()
 
     def with_steps(self, *steps: NamedStep) -> Self:
-        """The same selection with these correction steps. Each step replaces the step of the same class."""
+        """A copy of this selection with the given correction steps. Each given step replaces the step of the same
+        class."""
         kinds = {type(step) for step in steps}
         return replace(self, steps=(*(step for step in self.steps if type(step) not in kinds), *steps))
 

@@ -117,7 +117,7 @@ class QueuePlan:
         return {"scans": [scan.data() for scan in self.scans], **facts, **self.needs.data()}
 
     def refuse_impossible(self) -> None:
-        """Raise ConfigError with all faults of all scans, if there are any. Nothing was started."""
+        """Raise ConfigError with the faults of all scans, if any scan has a fault. Nothing was started."""
         of_scans = [_named(scan, fault) for scan in self.scans for fault in scan.faults]
         if of_scans or self.faults:
             bad = count(sum(not scan.valid for scan in self.scans), "scan")

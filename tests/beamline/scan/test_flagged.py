@@ -82,7 +82,7 @@ def test_an_alarm_pauses_a_scan_with_a_closed_shutter_until_it_is_resumed(
     ran = Ran(tmp_path, instrument, *WORDS, "monitor.policy.stuck=pause", f"scan.mode={mode}", heard=resume)
     assert ran.result.n_frames == 47
     ((message, was_open),) = paused
-    assert "Paused with a closed shutter: 2 consecutive frames have an alarm of the check `stuck` of the monitor" in message
+    assert "closed shutter: 2 consecutive frames have an alarm of the check `stuck` of the monitor" in message
     assert "use `beamline resume` to continue" in message
     assert not was_open
     on = [State.TAXI, State.ACQUIRING] if mode == "fly" else [State.ACQUIRING]
