@@ -133,7 +133,7 @@ class Instrument:
 
     def _config_of(self, sample: str | None, energy_kev: float | None, set: Mapping[str, object]) -> Config:
         if not self._open:
-            raise ConfigError("the instrument was closed: connect to it again. Nothing was started.")
+            raise ConfigError("the instrument was closed: call `connect` again. Nothing was started.")
         moved = not isinstance(self.config.devices.monochromator, NoMonochromator)
         named = {"sample.name": sample, "scan.energy" if moved else "optics.energy_kev": energy_kev}
         wanted = {**set, **{key: value for key, value in named.items() if value is not None}}

@@ -141,8 +141,8 @@ def yaml_faults(text: str, name: str) -> Iterator[type[Any]]:
         yield _fitting_loader(text, name)
     except RecursionError:
         raise ConfigError(
-            f"{name}: a list or a group contains itself through a YAML alias (*). Write its contents "
-            "out. Nothing was started."
+            f"{name}: a list or a group contains itself through a YAML alias (*). Write the contents out instead of "
+            "the alias. Nothing was started."
         ) from None
     except (yaml.YAMLError, *YAML_FAULTS) as error:
         line, what = _line_and_fault(error, text)

@@ -28,7 +28,7 @@ REMEDY = (
     "`beamline recon` corrects this change of the beam if there is air next to the sample (--air auto). Flats "
     "before and after the projections (scan.flats.at: both) also correct the change."
 )
-TAKEN_OFF = "`beamline recon` corrects this if there is air next to the sample (--air auto)."
+TAKEN_OFF = "`beamline recon` corrects this error if there is air next to the sample (--air auto)."
 GONE = 0.5  # a drift has ended if it is below this share of the limit
 PATIENCE = 20  # views after which a dip is the new normal
 MEMORY = 0.05  # weight of the newest view in the usual intensity
@@ -63,7 +63,7 @@ class BeamCheck(Logged):
     name: ClassVar[str] = "beam"
     bit: ClassVar[int] = 0
     unit: ClassVar[str] = "fraction of the intensity in the flats"
-    meaning: ClassVar[str] = "the beam intensity differs from that in the flats, or from the projections before"
+    meaning: ClassVar[str] = "the beam intensity differs from the flats, or from the projections before"
 
     drift: float = setting(0.02, "largest allowed drift of the beam intensity, up or down, as a fraction", ge=0)
     dip: float = setting(0.10, "sudden loss of beam intensity above which there is an alarm, as a fraction", ge=0, lt=1)

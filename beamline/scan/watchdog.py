@@ -131,7 +131,8 @@ class _Keeper:
             if not restarts_left:
                 self._sink(
                     Warned(
-                        f"The new watchdog also ended (code {code}): if the scan is killed now, the shutter stays open."
+                        f"The second watchdog has ended, too (code {code}): if the scan is killed now, the shutter "
+                        "stays open."
                     )
                 )
                 if pause is not None:

@@ -133,7 +133,7 @@ class SerialLine:
             raise DeviceError(
                 device,
                 f"the transcript {str(transcript)!r} cannot be written: {problem}",
-                advice="Give a file in an existing folder, or no file",
+                advice="Give a transcript file in an existing folder, or set transcript to null",
                 state="Nothing was sent",
             ) from problem
         try:

@@ -193,7 +193,7 @@ class SweptScan(TrialScan):
         """
         if not table.compared:
             reason = table.outcomes[0].message
-            raise DataError(f"No slice was made. Reason for the first one: {reason}.")
+            raise DataError(f"No slice was made. Reason for the first slice: {reason}.")
         direct = not self._trials[0].options.method.fitted
         if (scores := scores_of(self.unseen, direct=direct)) is None:
             outcomes = [replace(outcome, metrics={}) for outcome in table.outcomes]

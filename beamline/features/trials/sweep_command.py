@@ -104,7 +104,9 @@ def combinations(options: Sequence[SweptOption]) -> list[Mapping[str, str]]:
     names = [option.name for option in options]
     if not 1 <= len(names) <= 2 or len(set(names)) < len(names):
         given_options = ", ".join(names) or "none"
-        raise ValueError(f"{len(names)} options are given ({given_options}); expected one or two different ones")
+        raise ValueError(
+            f"{len(names)} options are given ({given_options}); expected one option, or two different options"
+        )
     combined: list[Mapping[str, str]] = [
         dict(zip(names, values, strict=True)) for values in itertools.product(*(option.values for option in options))
     ]

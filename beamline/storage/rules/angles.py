@@ -140,8 +140,8 @@ def _no_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64]) -> s
         span_rad = np.ptp(angles)
         return (
             f"The stated angles of {angles.size} projections span {n_turns:.1f} turns ({span_rad:.5g} rad). These "
-            "angles look like degrees that are labelled as radians. In that case give the angles with --angles FILE "
-            "(degrees, one per line)."
+            "angles look like degrees that are labelled as radians. If the values are degrees, give the angles with "
+            "--angles FILE (degrees, one per line)."
         )
     if between >= 360:
         first_angle = distinct[0]

@@ -127,7 +127,7 @@ class PiGcsSettings(Wiring, StageFigures):
     )
     firmware_pulse: float = setting(50e-6, "Pulse width of the firmware.", unit="s", gt=0)
     tolerance: int = setting(
-        10, "Largest distance from the target at which a move counts as arrived.", unit="counts", ge=0
+        10, "Largest distance from the target, in counts, at which a move counts as finished.", unit="counts", ge=0
     )
     settle: float = setting(
         1.0,

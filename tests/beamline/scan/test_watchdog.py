@@ -200,7 +200,7 @@ def test_a_watchdog_that_died_is_told_and_replaced_or_the_scan_pauses(
     monkeypatch.setattr(watchdog, "COMMAND", (sys.executable, "-c", "print('ready', flush=True)"))
     told, stop, pause = list[str](), StopRequest(), PauseRequest()
     with watched(tmp_path, lambda event: told.append(event.data["message"]), stop, pause if paused else None):
-        wait_until(lambda: any("also ended" in text for text in told))
+        wait_until(lambda: any("has ended, too" in text for text in told))
     assert sum("ended (code 0)" in text and "another one is started" in text for text in told) == watchdog.AGAIN
     assert ("no watchdog is running" in pause.reason) is paused and not stop.stopping
 
