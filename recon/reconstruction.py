@@ -52,20 +52,23 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstruct a volume from line integrals.
 
+    Values that are masked or not finite are filled from their neighbours and get weight 0. If photons are few, give the
+    measured `Counts` instead of line integrals. From `Counts`, the method gets line integrals with weights that
+    represent the likelihood of the counts (`recon.prep.counts.line_integrals`). The weights from the counts are
+    multiplied by `use.weights`. `Views` contain their geometry, their weights and the reach of the sample, so
+    `reconstruct` does not measure the reach again.
+
+    A fit always covers everything that the projections see. Therefore the voxels of a smaller box that you ask for are
+    identical to the same voxels of the whole volume.
+
     Args:
-        projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too). Values that are
-            masked or not finite are filled from their neighbours and get weight 0. If photons are few, give the
-            measured `Counts` instead. From `Counts`, the method gets line integrals with weights that represent the
-            likelihood of the counts (`recon.prep.counts.line_integrals`). The weights from the counts are multiplied by
-            `use.weights`. `Views` contain their geometry, their weights and the reach of the sample, so `reconstruct`
-            does not measure the reach again.
+        projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too); or `Counts` or
+            `Views`.
         geometry: geometry of the projections; None for `Views`.
         method: a name ("auto", or see `recon.methods.names`) for a method with its default settings, or a method with
             settings of its own, such as `recon.R2(steps=2000)` or `recon.FistaTv(tv_weight=2e-3)`.
-        grid: grid of the volume; None: one voxel per detector pixel. A fit always covers everything that the
-            projections see. Therefore the voxels of a smaller box that you ask for are identical to the same voxels of
-            the whole volume.
-        seed: seed of every random choice. The same seed gives the same volume on the same machine with the same number
+        grid: grid of the volume; None: one voxel per detector pixel.
+        seed: seed of every random choice; the same seed gives the same volume on the same machine with the same number
             of threads.
         device: where the method computes: "cpu" or "cuda" (the current CUDA device).
         use: weights of the rays, and held-out projections; None: equal weights, and all projections are used.

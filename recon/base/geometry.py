@@ -55,23 +55,21 @@ class Geometry:
     Attributes:
         angles: float64 [view], radians, any order, any range.
         detector_shape: (rows, cols) in pixels.
-        pixel_pitch: size of a detector pixel in mm. For a parallel beam, the pixel size is measured at the sample; for
-            a cone beam, on the detector. If the pixel pitch of a parallel beam is 1.0, all lengths are in pixels.
-        axis_col, axis_row: column of the rotation axis, and row of the height z = 0, on the detector. For a cone beam,
-            `axis_row` is the row that the central ray meets. `axis_col` and `axis_row` are in pixels, 0 at the centre
-            of the first column or row.
+        pixel_pitch: size of a detector pixel in mm, at the sample for a parallel beam, on the detector for a cone beam;
+            1.0 for a parallel beam: all lengths are in pixels.
+        axis_col, axis_row: column of the rotation axis, and row of the height z = 0 (for a cone beam: row that the
+            central ray meets), in pixels of the detector, 0 at the centre of the first column or row.
         sod, sdd: mm from the source to the rotation axis and to the detector; both infinite for a parallel beam.
         shifts: float64 [view, 2], displacement of each projection in pixels (col, row).
-        roll: float64 [view], radians; rotation of the detector about the beam. The column number of the rolled detector
-            grows along u cos(roll) + v sin(roll).
-        tilt: float64 [view], radians; tilt of the rotation axis along the beam. The row number of a tilted projection
-            grows along v cos(tilt) + d sin(tilt), with d the direction of the beam.
+        roll: float64 [view], radians; rotation of the detector about the beam, so that the column number grows along
+            u cos(roll) + v sin(roll).
+        tilt: float64 [view], radians; tilt of the rotation axis along the beam, so that the row number grows along
+            v cos(tilt) + d sin(tilt), with d the direction of the beam.
         width: how wide rays are (see `RayWidth`); the same for all rays.
         skew: angle in radians by which the stage turns from the readout of one row to the next (parallel beam only);
             `angles` are the angles of the first row.
         centres: float64 [view, 3], (x, y, z) in mm (cone beam only): the point that lies at the distance `sod` from the
-            source, along the beam of the projection. If `centres` is left out, the origin lies at the distance `sod`
-            from the source in all projections.
+            source, along the beam of the projection; left out: the origin in all projections.
     """
 
     angles: F64

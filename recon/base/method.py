@@ -76,12 +76,13 @@ the largest number.
 class DataUse(Checked):
     """How the projections are used.
 
+    FBP interpolates rays of weight 0 from their neighbours, and gives all other rays the same weight.
+
     Attributes:
-        weights: weight of each ray [view, row, col], 0 or more; None: 1 everywhere. FBP interpolates rays of weight 0
-            from their neighbours, and gives all other rays the same weight.
+        weights: weight of each ray [view, row, col], 0 or more; None: 1 everywhere.
         held_out: numbers of the projections that are not fitted; their residual is in the history.
-        times: [view] time of each exposure in s, for a method that makes volumes at several times. If `times` is None,
-            the exposures are evenly spaced in time, in the order of the projections.
+        times: [view] time of each exposure in s, for a method that makes volumes at several times; None: the exposures
+            are evenly spaced in time, in the order of the projections.
         sample_radius: mm from the rotation axis to the edge of a sample that is wider than the field of view; None: it
             is measured.
     """
@@ -96,19 +97,19 @@ class DataUse(Checked):
 class RunControl(Checked):
     """How a caller follows, stops and resumes a reconstruction.
 
+    If `should_stop` returns True, the reconstruction ends with the volume reached so far. Direct methods do not call
+    `should_stop`. Methods call `should_stop` through the property `stop`, which exists even if `should_stop` is None.
+
     Attributes:
-        should_stop: function (or a `Stop`) that is called between steps or iterations. If `should_stop` returns True,
-            the reconstruction ends with the volume reached so far. Direct methods do not call `should_stop`. Methods
-            call `should_stop` through the property `stop`, which exists even if `should_stop` is None.
+        should_stop: function (or a `Stop`) that is called between steps or iterations.
         on_progress: function that gets the progress: about ten times a second in a fit, after each iteration, or after
             every sixteen slices of FBP.
         on_checkpoint: function that gets the checkpoint of a fit every `checkpoint_every` s.
         resume: checkpoint from which a fit with the same data and settings continues.
-        decide: records the decisions that the method derives from its data. If `decide` contains the decisions of an
-            earlier run, the method repeats these decisions. If `decide` is None, the method decides by itself.
+        decide: records the decisions that the method derives from its data; the method repeats the decisions of an
+            earlier run that `decide` contains; None: the method decides by itself.
         stop_trials: function that is called after each iteration of the test reconstructions that choose the weight of
-            total variation. If `stop_trials` returns True, only the test reconstructions end. None: same as
-            `should_stop`.
+            total variation; True ends only the test reconstructions; None: same as `should_stop`.
     """
 
     should_stop: Callable[[], bool] | None = None
@@ -223,7 +224,8 @@ class Preview:
 class Reconstruction:
     """Result of a reconstruction: the volume and what the method reports about it.
 
-    `recon.reconstruct` and `Method.run` return it.
+    `recon.reconstruct` and `Method.run` return a `Reconstruction`. `Method.run` may leave `method` empty and `seconds`
+    0, because the caller of `run` fills in `method`, `seconds` and `ending`.
 
     Attributes:
         volume: the attenuation, `volume.data` float32 [z, y, x] in 1/mm.
@@ -231,9 +233,8 @@ class Reconstruction:
         history: progress of the fit or the iterations; empty for a direct method.
         gaussians: the Gaussian model of a fit (a `recon.splatting.gaussians.Gaussians`); None for other methods.
         checkpoint: state of a fit for `RunControl.resume`; see `checkpoint.arrays_of`.
-        method: name of the method; for `recon.Auto`, of the chosen method. `run` may leave `method` empty for the
-            caller to fill in.
-        seconds: wall time of the reconstruction in s. `run` may leave `seconds` 0 for the caller to fill in.
+        method: name of the method; for `recon.Auto`, of the chosen method.
+        seconds: wall time of the reconstruction in s.
         deviation: standard deviation of each voxel, see `recon.error_bars`; None: not computed.
         series: all volumes of a method that makes several volumes; the first one is also `volume`; None for a method
             that makes one volume.
@@ -241,7 +242,7 @@ class Reconstruction:
             by its number; None for a method that makes one volume.
         chosen: how an automatic choice or a preset found the settings; empty if they were given.
         started_from: number of Gaussians at the start of a fit; 0 for other methods.
-        ending: how the run ended. The caller of `run` fills in `ending`.
+        ending: how the run ended.
         outside: function that returns the contribution of the sample outside the volume to the projections of a
             geometry, [view, row, col]; None: no such contribution is known.
         change: the volume minus the reference, after the reference was moved to the position of the volume; None if no

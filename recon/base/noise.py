@@ -186,7 +186,9 @@ def _first_peak(curve: NDArray[np.float64], height: float, prominence: float) ->
         ]
         if top - max(valleys) >= prominence:
             return int(first + last) // 2
-    raise ValueError(f"the curve has no peak with a height of at least {height:.3g} and a prominence of at least {prominence:.3g}")
+    raise ValueError(
+        f"the curve has no peak with a height of at least {height:.3g} and a prominence of at least {prominence:.3g}"
+    )
 
 
 def _long_axes(images: F32) -> list[int]:

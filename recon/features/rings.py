@@ -143,8 +143,8 @@ def remove_rings(
     before a reconstruction.
 
     Args:
-        projections: [view, row, col], in any order. The data are not changed if there are fewer than 8 projections
-            or fewer than 64 columns.
+        projections: [view, row, col], in any order; with fewer than 8 projections, or fewer than 64 columns, the data
+            are not changed.
         angles: [view], radians.
         rings: "sort": small and medium stripes (Vo et al. 2018, algorithm 3); "vo": also dead columns and large
             stripes; "none": no removal; "auto": chosen from the data.

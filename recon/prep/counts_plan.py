@@ -40,20 +40,22 @@ class UnlitViewsError(ValueError):
 class CorrectionSettings:
     """Settings of the correction from counts to line integrals.
 
+    A transmission below `floor`, including zero and negative values, is replaced by `floor`; the line integral is then
+    -log(floor). A pixel is masked if its dark, or its response to the beam, differs from its neighbours by more than
+    `hot_threshold`. A pixel is a zinger if it exceeds both its surroundings and the same pixel in the neighbouring
+    projections by `zinger_threshold`, see `recon.prep.spots.spots`.
+
+    Each projection is divided by the level of its air columns. If both sides have air columns, the projection is
+    divided by a straight line between the levels of the left and the right side. If the line integral at the edges is
+    larger than `sample_from`, the setting "auto" of `air` assumes that the edges show the sample and not air, see
+    `references.edge_depth`.
+
     Attributes:
-        floor: lowest transmission. A transmission below the floor, including zero and negative values, is replaced by
-            the floor; the line integral is then -log(floor).
-        hot_threshold: limit in robust standard deviations. A pixel is masked if its dark, or its response to the beam,
-            differs from its neighbours by more than `hot_threshold`; with inf, no pixel is masked.
-        zinger_threshold: limit in standard deviations. A pixel is a zinger if it exceeds both its surroundings and the
-            same pixel in the neighbouring projections by this limit, see `recon.prep.spots.spots`; with inf, no zinger
-            is removed.
+        floor: lowest transmission.
+        hot_threshold: limit in robust standard deviations; inf: no pixel is masked.
+        zinger_threshold: limit in standard deviations; inf: no zinger is removed.
         air: number of columns (left, right) that see no sample in any projection, or "auto" to find them, or "none".
-            Each projection is divided by the level of its air columns. If both sides have air columns, the projection
-            is divided by a straight line between the levels of the left and the right side.
-        sample_from: limit of the line integral at the edges of the detector. If the line integral at the edges is
-            larger than `sample_from`, the setting "auto" of `air` assumes that the edges show the sample and not air,
-            see `references.edge_depth`.
+        sample_from: limit of the line integral at the edges of the detector.
     """
 
     floor: float = 1e-4

@@ -21,8 +21,8 @@ class Projections:
         data: float32 [view, row, col], dimensionless, finite.
         view_ids: int64 [view].
         floored: fraction of the values of live pixels that were raised to the lowest allowed transmission.
-        air: float32 [view], mean transmission of the air columns in each projection. The projection was divided by this
-            transmission. `air` is 1 if there are no air columns.
+        air: float32 [view], mean transmission of the air columns in each projection, by which the projection was
+            divided; 1 if there are no air columns.
         masked: bool [row, col], dead and hot pixels, filled from their neighbours in every projection.
         air_columns: (left, right) number of columns in which `air` was measured; (0, 0) if `air` was not measured.
         replaced: fraction of all values of live pixels that were zingers or not finite, and were filled from their
@@ -30,8 +30,7 @@ class Projections:
         weights: float32 [view, row, col], inverse variances of the line integrals, from the expected photons; 0 for
             masked pixels; None if photons were not counted.
         unmeasured: int64 [run, 4], runs of pixels without data in one projection, which were filled from their
-            neighbours. The four numbers of a run are the projection, the row, the first column, and the column after
-            the last column.
+            neighbours: projection, row, first column, and column after the last column of the run.
         spots_left: number of pixels in zingers that were too large to be filled, in these projections and all earlier
             ones.
     """

@@ -28,17 +28,16 @@ class References:
     """Darks (images without beam) and flats (images with beam but without sample).
 
     If darks or flats are a stack of frames [frame, row, col] of any real type, the stack is replaced by the mean of its
-    frames. Zingers of single frames do not enter the mean.
+    frames. Zingers of single frames do not enter the mean. The flat of a projection is computed from the flats of the
+    same part of the scan. If the part of the scan has no flats, the nearest group of flats is used.
 
     Attributes:
         dark: float32 [row, col], mean or median of the darks; or all darks as a stack.
-        flats: (position, float32 [row, col]) of each group of flats, or (position, stack). The position of a group of
-            flats is the number of the frame in the scan at which the flats were taken.
+        flats: (position, float32 [row, col]) of each group of flats, or (position, stack); the position is the number
+            of the frame in the scan at which the group was taken.
         dynamic: components of the differences between flats, from which the flat of each projection is computed; None
             if the flat of a projection is interpolated between groups of flats.
-        part_starts: the first frame of each part of the scan, ascending. The flat of a projection is computed from the
-            flats of the same part of the scan. If the part of the scan has no flats, the nearest group of flats is
-            used.
+        part_starts: the first frame of each part of the scan, ascending.
     """
 
     dark: Image

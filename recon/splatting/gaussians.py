@@ -26,15 +26,15 @@ class Gaussians:
     2024).
 
     With a kernel f other than exp(-q/2), the elements of the sum are still called Gaussians, and S still contains their
-    standard deviations.
+    standard deviations. A density is a multiple of the density unit, and its raw density sets only the multiple.
+    Therefore raw densities and their learning rates do not depend on the unit of length.
 
     Attributes:
         means: [n, 3] mm, (x, y, z).
         log_scales: [n, 3], logarithms of standard deviations in mm along the Gaussian's own axes.
         quaternions: [n, 4] (w, x, y, z), rotations; their length need not be 1, but must not be 0.
         raw_densities: [n]; ρ = density_unit * softplus(raw), so a density is never negative.
-        density_unit: a typical density in 1/mm. A density is a multiple of the density unit, and its raw density sets
-            only the multiple. Therefore raw densities and their learning rates do not depend on the unit of length.
+        density_unit: a typical density in 1/mm, the unit of the densities.
         kernel: radial profile f.
     """
 

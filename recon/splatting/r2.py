@@ -35,22 +35,22 @@ _TOY_STEPS, _TOY_GAUSSIANS = 4, 50
 class R2(Fit):
     """R²-Gaussian fit: fits a sum of Gaussians to the projections (Zha et al. 2024, with refinements).
 
+    The learning rates decay over the time `seconds`. The time `seconds` includes the compilation of kernels, unless
+    `warm_up` was called before. The fit always makes its start and its first step, even if `seconds` is too short for
+    them. `Reconstruction.gaussians` is the fitted model before the voxel refinement.
+
     Attributes:
         steps: number of steps; 0: the result is the starting point; None: 400 steps, or, if `seconds` is given, as many
             steps as the time allows.
-        seconds: time limit of the whole run by the caller's clock: start, steps, voxel refinement and volume. The
-            learning rates decay over the time `seconds`. The time `seconds` includes the compilation of kernels, unless
-            `warm_up` was called before. The fit always makes its start and its first step, even if `seconds` is too
-            short for them.
+        seconds: time limit of the whole run by the caller's clock: start, steps, voxel refinement and volume.
         gaussians: number of Gaussians at the start, or the Gaussians to start from; None: a number derived from the
             detector.
         start: volume from which the first Gaussians are sampled, see `initialise.first_volume`.
         early_stop: stop the fit when the residual in held-out projections no longer falls, and return the model with
             the lowest residual.
-        finish: iterations of the voxel refinement after the fit, see `finish.finish`. If `finish` is None, there are 8
-            iterations; discrete levels or steps of PnP-DCT follow if one of these predicts held-out projections better.
-            `Reconstruction.gaussians` is the fitted model before the voxel refinement.
-        allow_negative: True: the voxel refinement keeps voxels below zero. (Gaussians are never negative.)
+        finish: iterations of the voxel refinement after the fit, see `finish.finish`; None: 8 iterations, then discrete
+            levels or steps of PnP-DCT if one of these predicts held-out projections better.
+        allow_negative: True: the voxel refinement keeps voxels below zero; Gaussians are never negative.
         fit: further settings of the fit: weights of the loss terms, learning rates and limits.
     """
 

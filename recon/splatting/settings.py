@@ -187,40 +187,40 @@ TV_LEAST_SIDE = 32  # smallest side, in voxels, of the box of total variation (Z
 class FitSettings:
     """Settings of a Gaussian fit. Defaults are the published values (Zha et al. 2024) unless stated otherwise.
 
+    If the sample changes by more than 0.16 of the density unit per voxel, the default weight of total variation falls
+    with the square of this change. The default weight of total variation is at most 0.25. In the published code (weight
+    0.05), the gradient of total variation with respect to the centres is too small by the square of the voxel size, so
+    it has no effect. The correct gradient of total variation raises the PSNR of the walnut by 0.2 dB (60 projections)
+    and that of the battery by 0.4 dB (90 projections).
+
+    The published learning rates are for 30 000 steps, and a fit of 1000 steps with them is far from convergence. With
+    `pace` 20, two projections per step and a low last rate, a fit of 1000 steps gains 1 to 4 dB. With `pace` 26 and a
+    higher last rate, 400 steps before the voxel refinement suffice for a volume that needs 500 steps with `pace` 20.
+
     Attributes:
         loss: "l1" (published), "l2", or "poisson" (squares weighted by the transmission).
         ssim_weight: weight of 1 - SSIM, which is added to the loss.
         tv_weight: weight of total variation; None: 3e5 s² / n, where n is the number of pixels that a Gaussian covers,
-            and s is the noise of a pixel, divided by the density unit and by half the width of the field of view. If
-            the sample changes by more than 0.16 of the density unit per voxel, the weight falls with the square of this
-            change. The weight of total variation is at most 0.25.
-        tv_least: smallest weight of total variation in a fit of `paced_for` steps. In a longer fit the smallest weight
-            is lower, see `in_steps`.
+            and s is the noise of a pixel, divided by the density unit and by half the width of the field of view.
+        tv_least: smallest weight of total variation in a fit of `paced_for` steps; lower in a longer fit, see
+            `in_steps`.
         tv_size: voxels per side of the random box on which total variation acts; None: a quarter of the grid's side, 32
             to 96.
-        tv_moves: True: total variation may move the centres of Gaussians. In the published code (weight 0.05), the
-            gradient of total variation with respect to the centres is too small by the square of the voxel size, so it
-            has no effect. The correct gradient of total variation raises the PSNR of the walnut by 0.2 dB (60
-            projections) and that of the battery by 0.4 dB (90 projections).
+        tv_moves: True: total variation may move the centres of Gaussians.
         rates: learning rates at the first step: of centres (in units of half the width of the field of view), log
             scales, quaternions and raw densities.
-        pace: factor on all published rates. The published rates are for 30 000 steps, and a fit of 1000 steps with them
-            is far from convergence. With `pace` 20, two projections per step and a low last rate, a fit of 1000 steps
-            gains 1 to 4 dB. With `pace` 26 and a higher last rate, 400 steps before the voxel refinement suffice for a
-            volume that needs 500 steps with `pace` 20.
+        pace: factor on all published rates.
         paced_for: largest number of steps for which `pace` is used unchanged, see `in_steps`.
         decay: last rate / first rate; in between, the logarithm of the rate falls linearly.
         policy: density control; None: the number of Gaussians stays the same.
-        truncation: distance at which Gaussians are cut off. A compact kernel is not cut off, because it has a finite
-            radius.
-        smallest: smallest standard deviation in pixels. A thinner Gaussian could lie between the points at which pixels
-            are sampled.
+        truncation: distance at which Gaussians are cut off; compact kernels end at a finite radius and are not cut off.
+        smallest: smallest standard deviation in pixels, because a thinner Gaussian could lie between the points at
+            which pixels are sampled.
         views_per_step: number of projections whose gradients are averaged in a step.
-        joined_pixels: factor by which pixels are binned for the fit (not for the voxel refinement). If `joined_pixels`
-            is None, pixels become as wide as the Gaussians, see `initialise.joined_for`; this changes the pixels only
-            in large volumes.
+        joined_pixels: factor by which pixels are binned for the fit (not for the voxel refinement); None: pixels become
+            as wide as the Gaussians (see `initialise.joined_for`), which changes the pixels only in large volumes.
         rays: how the integral of a Gaussian along a ray is computed; it matters for cone beams.
-        kernel: radial profile of the Gaussians, or its name. A fit that starts from an existing model keeps the kernel
+        kernel: radial profile of the Gaussians, or its name; a fit that starts from an existing model keeps the kernel
             of that model.
     """
 

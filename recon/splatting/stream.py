@@ -38,12 +38,12 @@ _NEW = 0.2  # weight of the newest projection in the running mean of residuals b
 
 
 class StreamingFit:
-    """An R²-Gaussian fit that takes projections one by one, as a running scan delivers them.
+    """An R²-Gaussian fit that takes projections one by one, as a running scan delivers them. The fit covers everything
+    that the projections see, also outside the grid of the snapshots.
 
     Args:
         template: geometry of all future projections, with shift, roll and tilt; its angles are ignored.
-        grid: grid of the snapshots; None: it matches the detector. The fit itself covers everything that the
-            projections see.
+        grid: grid of the snapshots; None: the grid that matches the detector.
         gaussians: number of Gaussians at the start of the fit; None: derived from the detector (see `default_count`).
         settings: settings of the fit; `joined_pixels` can only be used in a fit of a finished scan.
         first_views, first_span: the fit starts when `first_views` projections have arrived and span `first_span`

@@ -61,12 +61,12 @@ class Discrete(HalfVoxels):
     is the FISTA-TV volume if discrete levels do not predict the held-out projections significantly better, or if a
     weaker pull to the levels predicts the held-out projections better. If the projections are too few to hold some out
     and no `levels` are given, the result is the FISTA-TV volume, too. If the caller gives a volume to start from, the
-    method uses total variation alone.
+    method uses total variation alone. If no projections can be held out, but `levels` are given, voxels are pulled
+    weakly to these levels.
 
     Attributes:
         iterations: largest number of iterations over all projections, not counting the FISTA-TV iterations before them.
-        levels: densities of the materials in 1/mm, ascending; None: found by expectation maximisation (EM). If no
-            projections can be held out, voxels are pulled weakly to the given `levels`.
+        levels: densities of the materials in 1/mm, ascending; None: found by expectation maximisation (EM).
         still, half_voxels: as in `FistaTv`.
     """
 

@@ -28,8 +28,8 @@ class TimeSeries(Series):
     """Reconstructs volumes at evenly spaced times from one scan of a changing sample, see `fit_series`.
 
     Attributes:
-        volumes: number of volumes, 2 or more, from the time of the first projection to the time of the last. Each
-            volume needs at least twelve projections.
+        volumes: number of volumes, 2 or more, from the time of the first projection to the time of the last, each with
+            at least twelve projections.
         moves: True: the sample also moves; False: only densities change; None: held-out projections decide whether the
             sample moves.
         sweeps: number of iterations of the fit.

@@ -206,9 +206,9 @@ def fit_share(
     Args:
         found: result of `fit_materials` from the same projections.
         states: indices in `found.densities` of the two states.
-        go_on: function called before each of at most `STEPS` steps. The argument of `go_on` is the largest number of
-            steps that may follow the next step. If `go_on` returns False, the function returns `found`, unchanged.
-        stop: function called many times within a step. If `stop` returns True, the function returns `found`, unchanged.
+        go_on: function called before each of at most `STEPS` steps, with the largest number of steps that may follow
+            the next step; False: the result is `found`, unchanged.
+        stop: function called many times within a step; True: the result is `found`, unchanged.
 
     Raises:
         ValueError: `states` are not two different materials.

@@ -89,11 +89,11 @@ class TimedVolumes:
         times: float64 [knot], in the unit of the projections' times, evenly spaced from the first projection to the
             last.
         volumes: float32 [knot, z, y, x], attenuation in 1/mm (1/px if the pitch is 1), 0 or more, before the motion is
-            applied. `at` gives the displaced volume.
+            applied (`at` gives the displaced volume).
         grid: grid of each volume.
         residual: norm of the residual of the projections, divided by the norm of the projections.
         motion: displacement field of the sample in time; a voxel of the displaced volume gets the value at its own
-            place plus the displacement. None: nothing moves.
+            place plus the displacement; None: nothing moves.
         unseen_residuals: residuals of coarse volumes in held-out projections, without motion and with motion; None if
             held-out projections did not decide about motion.
         smooth: smoothness of the factors (module `proportions`), if each volume is the mean volume multiplied by smooth
@@ -153,14 +153,14 @@ def fit_series(
     gets a countdown of the steps that fit the factors. If `go_on` ends the fit of the factors early, the result is the
     volumes without factors.
 
+    Use motion for a sample that settles. If only the densities of the sample change, `motion=True` finds motion that
+    does not exist. For a sample that does not change, `tv_weight` has the same effect as the same weight for a single
+    volume from all projections.
+
     Args:
         knots: number of volumes, 2 or more.
         motion: True: also estimate the motion; None: use the motion only if it predicts held-out projections better.
-            Use motion for a sample that settles. If only the densities of the sample change, `motion=True` finds motion
-            that does not exist.
-        tv_weight: μ of all components. For a sample that does not change, `tv_weight` has the same effect as the same
-            weight for a single volume from all projections. If `tv_weight` is None, the weight that predicts held-out
-            projections best is used.
+        tv_weight: μ of all components; None: the weight that predicts held-out projections best.
 
     Raises:
         ValueError: a volume has fewer than twelve projections, or fewer than six projections are nearer in time to this

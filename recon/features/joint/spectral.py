@@ -86,15 +86,17 @@ def fit_materials(
     After each step, densities below 0 are set to 0. Long & Fessler (2014, IEEE TMI 33, 1614) also fit the densities of
     materials to spectral projections in one step. Memory: seven volumes per material, three times the projections.
 
+    During the test reconstructions for the weights, the first argument of `go_on` is -n, where n is the number of
+    iterations that may still follow (at most `TRIAL_SWEEPS`).
+
     Args:
         grid: grid of the volumes; None: the grid of the geometry.
         tv_weight: weight for all components; None: the weights that predict held-out projections best.
-        sweeps: number of iterations. An iteration has about nine steps, which use all projections equally often.
-        go_on: function called with (iteration, residual) after each iteration. During the test reconstructions for the
-            weights, the first argument is -n, where n is the number of iterations that may still follow (at most
-            `TRIAL_SWEEPS`). If `go_on` returns False, the fit ends with the volumes reached so far.
-        stop: function called many times within an iteration, from the second step on. If `stop` returns True, the fit
-            ends with the volumes from before the current step.
+        sweeps: number of iterations, each of about nine steps that use all projections equally often.
+        go_on: function called with (iteration, residual) after each iteration; False ends the fit with the volumes
+            reached so far.
+        stop: function called many times within an iteration, from the second step on; True ends the fit with the
+            volumes from before the current step.
     """
     check_arguments(fit_materials, locals())
     warn_of_other_quantity(views.projections)
