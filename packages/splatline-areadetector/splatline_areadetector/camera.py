@@ -212,8 +212,11 @@ class AreaDetectorCamera:
             if lost:
                 raise DeviceError(
                     self.name,
-                    f"{lost} frames are lost, because the memory for {self._ring_size} waiting frames was full",
-                    advice="Fetch frames faster, trigger more slowly, or raise ring_mb (memory for waiting frames)",
+                    f"the ring buffer of {self._ring_size} frames was overrun and {lost} frames are lost",
+                    advice=(
+                        "Fetch frames faster, trigger more slowly, or raise ring_mb (memory for frames that wait "
+                        "for the disk)"
+                    ),
                     state="Later frames can be taken",
                 )  # fmt: skip
             if self._ring:

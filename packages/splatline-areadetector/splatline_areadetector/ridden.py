@@ -366,7 +366,7 @@ class RiddenFrames:
         missing = "frame" if n == 1 else f"{n} frames"
         return (
             f"The number of the first projection is not known, so the missing {missing} may be the first of the scan. "
-            f"If so, {wrong}. Set {key} or ride.first_id to avoid wrong angles and kinds of frames."
+            f"If so, {wrong}. Set {key} or ride.first_id, so that the number of the first projection is known."
         )
 
     def _raise_outcome(self) -> None:

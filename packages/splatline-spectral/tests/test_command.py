@@ -81,7 +81,10 @@ def test_measured_radiographs_and_several_regions(folder: Path) -> None:
     [
         (["edge_scan"], "in keV, such as --from 8.30 --to 8.42"),
         (["edge_scan", "--from", "8.3", "--to", "8.305"], "there are 6 energies, but there must be 9 to 5000"),
-        (["edge_scan", "--from", "8.3", "--to", "8.4", "--material", "Cu"], "choose one of electrolyte, NMC811"),
+        (
+            ["edge_scan", "--from", "8.3", "--to", "8.4", "--material", "Cu"],
+            "choose one of the materials electrolyte, NMC811",
+        ),
         (["mu.csv"], "unit of the file with --unit"),
         (["mu.h5", "--from", "8.395"], "an edge needs 9 energies, but only"),
         (["none.h5"], "none.h5"),

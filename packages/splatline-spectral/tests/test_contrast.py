@@ -247,5 +247,5 @@ def test_the_noise_is_that_of_the_curve() -> None:
 
 @pytest.mark.parametrize("energies", [np.linspace(8, 9, LEAST - 1), np.array([*np.linspace(8, 9, LEAST), 9.0])])
 def test_too_few_energies_or_unsorted_ones_are_refused(energies: Reals) -> None:
-    with pytest.raises(ValueError, match=f"{LEAST} rising"):
+    with pytest.raises(ValueError, match=f"{LEAST} energies in rising order"):
         find_edge(energies, np.ones_like(energies))

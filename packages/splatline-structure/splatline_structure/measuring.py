@@ -122,8 +122,8 @@ def halves_in(path: Path, read: volumes.ReadSlices, answer: Answer, **values: An
     scan = values["scan"] or Path(read.record.raw_file)
     if not scan.is_file():
         answer.warn(
-            f"The intervals of {path} leave out the error from few projections, because the scan {scan}, which the "
-            "volume names, does not exist. Give --scan or --parts."
+            f"The intervals of {path} leave out the error from few projections, because the scan of the volume "
+            f"({scan}) does not exist. Give --scan or --parts."
         )
         return []
     if (n_views := int(read.record.parameters.get("n_views", FEWEST_VIEWS))) < FEWEST_VIEWS:

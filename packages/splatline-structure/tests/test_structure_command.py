@@ -335,5 +335,5 @@ def test_the_former_name_says_what_to_use(here: Path) -> None:
 
 def test_a_scan_that_is_not_there_is_a_warning(here: Path, undrawn: None) -> None:
     result = beamline("structure", "can.npy", *VOXEL_UM, "--side", "0")
-    assert result.exit_code == 0 and "because its scan" in result.stderr
+    assert result.exit_code == 0 and "because the scan of the volume (" in result.stderr
     assert command.structure.name == "structure"
