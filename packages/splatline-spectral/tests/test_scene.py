@@ -115,7 +115,7 @@ def test_a_beam_too_bright_for_the_sensor_tells_nothing(tmp_path: Path) -> None:
     [
         ({"phantom": {"kind": "solids", "solids": [{"kind": "box", "edges": [1, 1, 1], "attenuation": 1}]}}, None,
          "give the sample the key `material`: without a material"),
-        ({"phantom": SCENE["phantom"] | {"materials": {}}}, None, "the materials electrolyte, NMC811 .0 of these materials"),
+        ({"phantom": SCENE["phantom"] | {"materials": {}}}, None, "the materials electrolyte, NMC811 .0 of these"),
         ({}, "Cu", "--material Cu: choose one of the materials electrolyte, NMC811"),
         ({"beam": {"photons_per_s": 1}}, None, "materials need the beam's energy"),
         ({"detector": {"shape": [4, 4], "pixel_size_um": 0.1}, "axis_offset_px": 3000.0}, None,
