@@ -40,7 +40,7 @@ def test_the_plug_ins_of_a_kind_come_by_name(announced: list[EntryPoint]) -> Non
         ([("twice", "math:e"), ("twice", "math:tau")], r"used by another plug-in"),
         ([("gone", "no_such_module:thing")], r"The volume format 'gone' .*ModuleNotFoundError"),
         ([("wrong", "math:no_such_thing")], r"AttributeError"),
-        ([("odd", "math:inf")], r"OverflowError.*Everything else works without it"),
+        ([("odd", "math:inf")], r"OverflowError.*Everything else works without this plug-in"),
     ],
 )
 def test_what_does_not_load_or_fit_or_has_a_name_that_is_taken_is_left_out_with_a_warning(

@@ -297,7 +297,7 @@ def test_a_round_body_has_its_density_and_a_missing_wedge_is_told(lost: tuple[in
     degrees = np.array([each for each in np.arange(0, 180, 1.0) if not lost[0] <= each < lost[1]])
     geometry = Geometry.parallel(np.radians(degrees), (1, 64))
     views = disc_views(geometry, 12, (9.0, 5.0))
-    told = pytest.warns(UserWarning, match="right for round bodies") if lost[1] else nullcontext()
+    told = pytest.warns(UserWarning, match="right only for round bodies") if lost[1] else nullcontext()
     with told:
         image = reconstruct(views, geometry, "fbp").volume
     _, y, x = image.grid.coordinates()
