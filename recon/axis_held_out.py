@@ -58,7 +58,7 @@ def axis_by_views(
 
     Returns:
         The estimate. `AxisEstimate.confident` is False if the residual of the best candidate is nearly as large as the
-        residuals of the others.
+        residuals of the other candidates.
 
     Raises:
         AxisError: the best candidate is farther from `axis_col` of `geometry` than a fifth of the detector's width, or

@@ -33,10 +33,10 @@ class Kernel(StrEnum):
 
     @classmethod
     def of_exponent(cls, exponent: float) -> Kernel:
-        """The kernel with this exponent (infinite for a Gaussian), as stored in files.
+        """The kernel with the exponent `exponent` (infinite for a Gaussian), as files store it.
 
         Raises:
-            ValueError: there is no kernel with this exponent.
+            ValueError: there is no kernel with the exponent `exponent`.
         """
         for kernel in cls:
             if kernel.exponent == exponent:

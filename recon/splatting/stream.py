@@ -134,9 +134,9 @@ class StreamingFit:
 
         If the new data differ by more than a fifth (norm) from the data with which the Gaussians were placed, the
         Gaussians are placed again. If the new data differ by at most a fifth, the model is kept. `kept` are the
-        numbers, in order, of the projections to which these data belong. If `kept` is given, the fit drops all other
-        projections. After projections were dropped, the learning rates start again from their first values, because the
-        model was fitted to the dropped projections, too.
+        numbers, in order, of the projections to which the new line integrals belong. If `kept` is given, the fit drops
+        all other projections. After projections were dropped, the learning rates start again from their first values,
+        because the model was fitted to the dropped projections, too.
 
         Raises:
             ValueError: as for `add_views`, or there are no projections; nothing is changed.

@@ -136,7 +136,7 @@ class Projector:
         return rows * (1 + (cols - 1) * min(share, 1.0))
 
     def subset(self, views: Sequence[int] | NDArray[np.integer] | slice) -> Projector:
-        """The projector for some of the projections, in this order."""
+        """The projector for only the projections `views`, in the order of `views`."""
         return replace(self, geometry=self.geometry.select(views))
 
     def __call__(self, volume: F32) -> F32:

@@ -102,8 +102,8 @@ class Discrete(HalfVoxels):
 
     @property
     def refused_sweeps(self) -> int:
-        """Number of iterations of the tests that may reject discrete levels for the voxel refinement of a Gaussian fit;
-        usually there are not more. After a rejection, PnP-DCT may be tried.
+        """Usual largest number of iterations of the tests that may reject discrete levels for the voxel refinement of a
+        Gaussian fit. After a rejection of discrete levels, PnP-DCT may be tried.
         """
         return _REJECTED * self.usual_sweeps
 

@@ -52,12 +52,12 @@ class Materials:
     residual: float
 
     def share(self, of: int, others: Sequence[int], least: float) -> F32:
-        """The density of a material, divided by the sum of the densities of this material and the others, [z, y, x], 0
-        to 1. For example, the share of a charged material is the state of charge of a battery electrode.
+        """The density of the material `of`, divided by the sum of the densities of the materials `of` and `others`, [z,
+        y, x], 0 to 1. For example, the share of a charged material is the state of charge of a battery electrode.
 
         Args:
-            least: smallest sum of the densities of this material and the others, for which a share is computed. Voxels
-                with a smaller sum of densities get NaN.
+            least: smallest sum of the densities of the materials `of` and `others` for which a share is computed.
+                Voxels with a smaller sum of densities get NaN.
         """
         part = self.densities[of]
         total = part + self.densities[list(others)].sum(0)
