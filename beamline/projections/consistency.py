@@ -262,9 +262,9 @@ def _steady(
             "this scan do"
         )
     sentence = (
-        f"{what}, and there is no air next to the sample to correct this. Intensity, exposure, energy or "
-        "filter changed, or some projections belong to another scan. Use --views to choose "
-        "projections that belong together, or --air to state which columns are air."
+        f"{what}, and there is no air next to the sample to correct the intensity. Intensity, exposure, energy or "
+        "filter changed, or some projections belong to another scan. Use --views to choose projections that belong "
+        "together, or --air to state which columns are air."
     )
     return ConsistencyCondition("light of opposite views", size, _STEP_OF_LIGHT, "in line integral", sentence)
 

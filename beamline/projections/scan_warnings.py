@@ -147,30 +147,30 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
         (
             unseen.mean(),
             Note,
-            "of the detector got no beam or is saturated. The rays of these pixels count as missing data.",
+            "{share} of the detector got no beam or is saturated. The rays of these pixels count as missing data.",
         ),
         (
             (masked & ~unseen).mean(),
             Note,
-            "of the detector's pixels are dead or hot. The values of these pixels were replaced with values of "
-            "neighbouring pixels.",
+            "{share} of the detector's pixels are dead or hot. The values of these pixels were replaced with values "
+            "of neighbouring pixels.",
         ),
         (
             corrected.replaced,
             Note,
-            "of the pixels were zingers (bright spots in one projection only) or not finite. The values of these "
-            "pixels were replaced with values of neighbouring pixels.",
+            "{share} of the pixels were zingers (bright spots in one projection only) or not finite. The values of "
+            "these pixels were replaced with values of neighbouring pixels.",
         ),
         (
             corrected.floored,
             str,
-            "of the pixels transmit less than the smallest transmission that is used (--floor). The true "
+            "{share} of the pixels transmit less than the smallest transmission that is used (--floor). The true "
             "attenuation there is at least what the volume shows, unless the darks are too high.",
         ),
     )
     for share, kind, text in shares:
         if share > 1e-3:
-            warn(kind(f"{share:.1%} {text}"))
+            warn(kind(text.format(share=f"{share:.1%}")))
     for dead_rows, so in (
         (np.setdiff1d(lost, between), "0 in the volume"),
         (between, "interpolated from their neighbours"),

@@ -176,7 +176,9 @@ NXTOMO: tuple[Entry, ...] = (
     Entry("definition", "not needed: the kind of the file is recognised by its structure"),
     Entry("detector/data", "frames [frame, row, col]; the attribute `axes` of NXdata must not state another order"),
     Entry("detector/image_key", "kind of each frame; a frame with an undefined code is invalid"),
-    Entry("detector/image_key_control", "as image_key, and -1 for an alignment frame; overrides image_key"),
+    Entry(
+        "detector/image_key_control", "the same codes as image_key, and -1 for an alignment frame; overrides image_key"
+    ),
     Entry("detector/count_time", "exposure time of each frame", units=datasets.TIME_UNITS),
     Entry(
         "detector/x_pixel_size",
