@@ -19,16 +19,17 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError, ScanStopped
 from beamline.core.events import BlockDone, BlockStarted, StateEntered, Warned
 from beamline.core.stop import ScanAborted, StopRequest
-from beamline.core.text import count, spans
+from beamline.core.text import count
 from beamline.scan.control import State
 from beamline.scan.ledger import EXTRA, LedgerError
 from beamline.scan.measurement import Measurement
 from drivers.base.frame import Frame, FrameKind
 from splatline_areadetector.arrays import ArrayFrame
 from splatline_areadetector.config import RideConfig
-from splatline_areadetector.counters import Counters, Gap, Silence, loss_sentences
-from splatline_areadetector.frame_places import Basis, Decision, FramePosition, NewEpoch, Outside, Seen, Unknown
+from splatline_areadetector.counters import Counters, Gap, Silence
+from splatline_areadetector.frame_places import Decision, FramePosition, NewEpoch, Outside, Seen, Unknown
 from splatline_areadetector.guides import EXPOSURE, Guide, seconds_of
+from splatline_areadetector.losses import Losses, first_or_last_sentence, missing_sentences
 from splatline_areadetector.plan import RidePlan
 from splatline_areadetector.sorter import Sorter
 from splatline_areadetector.stream import Died, Disconnected, FrameStream, Overflow, Refused
@@ -85,12 +86,9 @@ class RiddenFrames:
         self._stream, self._guide = ride.stream, ride.guide
         self._sink, self._stop = measurement.sink, measurement.stop
         self._sorter = Sorter(plan.blocks, first_id, ride.counters, before, began_within_scan=began_within_scan)
-        self._gaps: list[Gap] = []
-        self._overflowed: set[int] = set()
+        self._losses = Losses()
         self._last: ArrayFrame | None = None  # the last frame that has a place in the plan
         self._arrived: ArrayFrame | None = None  # the last frame
-        self._unplaced: dict[str, list[int]] = {}
-        self._unused: dict[str, list[int]] = {}  # for each reason, numbers of frames that arrived and cannot be used
         self._block, self._block_kind, self._in_block = -1, "", 0
         self._gone = self._reported_outside = False
         self._reported_pause = self._epoch = ""
@@ -153,10 +151,10 @@ class RiddenFrames:
                         "started."
                     )
                 case Overflow(unique_id):
-                    self._overflowed.add(unique_id)
+                    self._losses.overflowed.add(unique_id)
                     yield from self._stored(self._sorter.decided(1))
                     if (lost := self._sorter.pass_over(unique_id)) and self._last is not None:
-                        self._gaps.append(Gap(lost, self._last.time, self._last.time))
+                        self._losses.gaps.append(Gap(lost, self._last.time, self._last.time))
                 case Refused(unique_id, why):
                     raise DataError(
                         f"Frame {unique_id} of {self._stream.name} cannot be stored: {why}. Earlier frames are in "
@@ -226,19 +224,16 @@ class RiddenFrames:
         return None
 
     def _cannot_use(self, frame: ArrayFrame, why: str) -> None:
-        if why not in self._unused:
+        if self._losses.is_first_unused(why, frame.unique_id):
             self._warn(
                 f"Frame {frame.unique_id} counts as missing: {why}. Further frames of this kind are listed at the end."
             )
-        self._unused.setdefault(why, []).append(frame.unique_id)
 
     def _unknown(self, frame: ArrayFrame, place: Unknown) -> Frame | None:
         """A frame that cannot be assigned, stored as an invalid row if it has the size of the others. The first frame
         of each cause gives a message, and all are listed at the end."""
         fate = "stored as an invalid row" if place.fits else "not stored"
-        frames = self._unplaced.setdefault(f"{place.why} ({fate})", [])
-        frames.append(frame.unique_id)
-        if len(frames) == 1:
+        if self._losses.is_first_unplaced(f"{place.why} ({fate})", frame.unique_id):
             self._warn(f"Frame {frame.unique_id} is {fate}, because {place.why}.")
         if not place.fits or (counts := self._counts(frame)) is None:
             return None
@@ -250,7 +245,7 @@ class RiddenFrames:
 
     def _add_gap(self, ids: range, before: ArrayFrame, after: ArrayFrame) -> None:
         still = self._stream.stalled_seconds(before.time, after.time)
-        self._gaps.append(Gap(ids, before.time, after.time, still))
+        self._losses.gaps.append(Gap(ids, before.time, after.time, still))
 
     def _other_size(self, frame: ArrayFrame) -> str:
         """Why the file is closed: a frame of another size or type."""
@@ -312,30 +307,10 @@ class RiddenFrames:
         Args:
             ended: whether the scan ended by itself, without a stop and without a new epoch.
         """
-        words = []
-        for i, block in enumerate(self._plan.blocks):
-            if missing := self._sorter.missing(i):
-                noun, angles = block.kind.name.lower(), self._plan.angles
-                angle_words = ""
-                if block.kind is FrameKind.PROJECTION and not np.isnan(angles).any():
-                    first, last = (math.degrees(angles[missing[end]]) for end in (0, -1))
-                    angle_words = f" (from {first:.4g}° to {last:.4g}°)"
-                are = "is" if len(missing) == 1 else "are"
-                words.append(f"{len(missing)} of {block.n} {noun}s {are} missing: {spans(missing)}{angle_words}.")
-        words.append(self._first_or_last(ended))
-        for why, ids in self._unused.items():
-            words.append(f"{count(len(ids), 'frame')} arrived ({spans(ids)}) but could not be used: {why}.")
-        if self._unused and self._guide.status:
-            words.append(f"Now: {self._guide.status}.")
-        words += loss_sentences(self._gaps, self._overflowed, self._ride.counters)
-        if self._sorter.repeats:
-            words.append(
-                f"{count(self._sorter.repeats, 'frame')} arrived twice and "
-                f"{'was' if self._sorter.repeats == 1 else 'were'} stored once."
-            )
-        for why, ids in self._unplaced.items():
-            frames = "Frame {}" if len(ids) == 1 else "Frames {}"
-            words.append(f"{frames.format(spans(sorted(ids)))} could not be assigned: {why}.")
+        words = missing_sentences(self._plan, self._sorter)
+        if self._views:
+            words.append(first_or_last_sentence(self._plan, self._sorter, ended=ended))
+        words += self._losses.sentences(self._guide.status, self._ride.counters, self._sorter.repeats)
         return "".join(f" {sentence}" for sentence in words if sentence)
 
     def _first_or_last(self, ended: bool) -> str:

@@ -98,6 +98,42 @@ def n_before_views(blocks: Sequence[PlannedBlock]) -> int:
     return sum(block.n for block in blocks[: [*(block.kind for block in blocks), VIEW].index(VIEW)])
 
 
+@dataclass
+class ContinuedCount:
+    """Continues the numbers of frames beyond the end of a counter of 16 or 32 bits.
+
+    Attributes:
+        raw: the last number as it was received.
+    """
+
+    raw: int | None
+    # how far the counter went back at the end of its range: at the last time, and in total
+    _last_wrap: int = 0
+    _wrapped: int = 0
+
+    def continued(self, raw: int, time: float, times: Sequence[float], *, is_anew: bool) -> tuple[int, str]:
+        """The number of the next frame, continued, and a message if numbers were left out, otherwise "". If more time
+        has passed than between the frames before, number 0 may be lost.
+
+        Args:
+            time, times: IOC's time of this frame, and of the frames before.
+            is_anew: the counter may have restarted for another reason.
+        """
+        last, self.raw, note = raw if self.raw is None else self.raw, raw, ""
+        for low, top in _RANGES:
+            if top - _NEAR <= last <= top and low <= raw <= low + _NEAR and not is_anew:
+                self._last_wrap = top - low + (low != 0 or raw == 0)  # cameras of GigE Vision leave out 0
+                self._wrapped += self._last_wrap
+                is_long = len(times) > 2 and time - times[-1] > 1.5 * float(np.median(np.diff(times)))
+                if last < top or raw > low + 1 or (raw != low and is_long):
+                    left_out = "" if self._last_wrap > top - low else f", and {low} as if it had been skipped"
+                    note = f"Numbers went from {last} to {raw}: the count is continued beyond {top}{left_out}."
+            elif self._last_wrap and top - _NEAR <= raw <= top and low <= last <= low + _NEAR:
+                self.raw = last  # exchanged with its neighbour
+                return raw + self._wrapped - self._last_wrap, note
+        return raw + self._wrapped, note
+
+
 class Sorter:
     """Assigns frames to the plan's blocks.
 
@@ -121,10 +157,7 @@ class Sorter:
         self._began_within_scan = began_within_scan
         self._taken: dict[int, _Taken] = {}  # by the number of the planned block; blocks that were not planned follow
         self._now, self._serial, self._step = -1, 0, 0  # step 0: not known yet
-        self._raw = None if before is None else before.number  # the last number as it was received
-        self._last_wrap = self._wrapped = (
-            0  # how far the counter went back at the end of its range: at the last time, and in total
-        )
+        self._numbers = ContinuedCount(None if before is None else before.number)
         self._last = self._known = before
         self._recent = deque[Seen](maxlen=WINDOW)
         self._size: Any = None
