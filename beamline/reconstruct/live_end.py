@@ -97,4 +97,4 @@ def final_fit(
         f"refinement of the voxel volume; at most {seconds:g} s. Ctrl-C keeps the volume reached so far"
     )
     live.sink(StateEntered("finishing", message, time=written))
-    return FinalFit(last.fit, live.options.streaming, seconds, live.begin, last.history, look)
+    return FinalFit(last.fit, live.method, seconds, live.begin, last.history, look)

@@ -9,19 +9,16 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from beamline.core.errors import DataError
-from beamline.core.events import Sink
-from beamline.core.sinks import Warnings
-from beamline.projections.views import checked_views, select
+from beamline.projections.views import checked_views
 from beamline.reconstruct.followed_views import FollowedViews
 from beamline.reconstruct.job import progress_events
 from beamline.reconstruct.live_end import ended, final_fit
 from beamline.reconstruct.live_states import Cursor, Feeds, Following, LastFit, LiveScan, WaitsForAxis
 from beamline.reconstruct.live_steps import after_progress, corrected_alone, first_state, next_state
-from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.options import OutputPaths
 from beamline.reconstruct.pass_laws import PassLaws
 from beamline.reconstruct.snapshots import LiveSlices, Snapshots
 from beamline.storage.readers.base import ScanSource
-from drivers.base.clock import Clock
 from recon.splatting.time_limit import FinalFit
 
 _LEAST_VIEWS = 16  # projections needed for a volume after a stop
@@ -36,15 +33,14 @@ class ScanFollower:
         snapshots: the files that show the volume so far.
     """
 
-    def __init__(self, options: ReconOptions, source: ScanSource, sink: Sink, clock: Clock, warn: Warnings) -> None:
-        views = FollowedViews(select(source, options.selection))
-        self._live = LiveScan(options, views, sink, clock, warn, begin=clock.now())
-        self.state: Following = first_state(self._live)
+    def __init__(self, live: LiveScan, target: OutputPaths) -> None:
+        self._live, sink, clock = live, live.sink, live.clock
+        self.state: Following = first_state(live)
         self._cursor = Cursor()
         self._tell_progress = progress_events(sink, clock, waiting=lambda: self.waiting)
-        self._laws = PassLaws(views, options.seed, sink, clock, warn)
-        self.snapshots = Snapshots(options, source, sink, clock, warn)
-        self._slices = LiveSlices(views, self.snapshots, clock)
+        self._laws = PassLaws(live.views, live.seed, sink, clock, live.warn)
+        self.snapshots = Snapshots(target, live.views, sink, clock, live.warn)
+        self._slices = LiveSlices(live.views, self.snapshots, clock)
 
     @property
     def source(self) -> ScanSource:
@@ -128,7 +124,7 @@ class ScanFollower:
         begun.
         """
         if isinstance(self.state, Feeds):
-            self.snapshots.write(self.state.fit, float(self.state.axis_col))
+            self.snapshots.write(self._live.method.name, self.state.fit, float(self.state.axis_col))
 
     def end(self) -> LastFit:
         """All projections with their final correction, and the fit to them. No projection is added afterwards.
@@ -149,6 +145,8 @@ class ScanFollower:
 
     def final_fit(self, last: LastFit, seconds: float, snapshot_every: float) -> FinalFit:
         """The final fit of the volume, with snapshots."""
-        return final_fit(
-            self._live, last, seconds, snapshot_every, lambda: self.snapshots.write(last.fit, float(last.axis_col))
-        )
+
+        def write() -> None:
+            self.snapshots.write(self._live.method.name, last.fit, float(last.axis_col))
+
+        return final_fit(self._live, last, seconds, snapshot_every, write)

@@ -11,19 +11,15 @@ from contextlib import suppress
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.core.events import Sink
 from beamline.core.sinks import Warnings
 from beamline.projections.correction import apply, survey
-from beamline.projections.views import select
 from beamline.reconstruct.followed_views import AxisSearch, FollowedViews
-from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.snapshots import FEWEST, LiveSlices, Snapshots
 from beamline.report.live_picture import PictureRow, reference_row
-from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
-from recon.base.method import Preview
+from recon.base.method import Method, Preview
 from recon.base.view_data import Views
 from recon.base.views import spread
 
@@ -35,18 +31,17 @@ _MOST_VIEWS = 180  # largest number of projections that are corrected for a pict
 class ReferencePictures:
     """Draws pictures of a running scan whose method needs all projections, and so waits for the end of the scan.
 
-    Attributes:
-        snapshots: has the path of the picture.
+    Args:
+        snapshots: the file of the picture.
     """
 
-    def __init__(self, options: ReconOptions, source: ScanSource, sink: Sink, clock: Clock, warn: Warnings) -> None:
-        self._views, self._warn = FollowedViews(select(source, options.selection)), warn
-        self.snapshots = Snapshots(options, source, sink, clock, warn)
-        self._slices = LiveSlices(
-            self._views, self.snapshots, clock, row_of(options.method.preview, self.snapshots.unit)
-        )
-        self._search, stated = AxisSearch(), options.selection.axis_col
-        self._axis = source.axis_col if stated is None else stated
+    def __init__(
+        self, views: FollowedViews, method: Method, snapshots: Snapshots, clock: Clock, warn: Warnings
+    ) -> None:
+        self._views, self._warn = views, warn
+        self._slices = LiveSlices(views, snapshots, clock, row_of(method.preview, snapshots.unit))
+        self._search, stated = AxisSearch(), views.scan.selection.axis_col
+        self._axis = views.source.axis_col if stated is None else stated
 
     def draw(self, pause: float | None) -> None:
         """Draw the projections so far, if there are new ones, and `pause` s and the time that the last drawing took

@@ -25,11 +25,11 @@ from beamline.projections.selection import ScanSelection, SelectedScan
 from beamline.projections.step import StepDone
 from beamline.reconstruct.followed_views import AxisSearch, FollowedViews
 from beamline.reconstruct.job import corrections_done
-from beamline.reconstruct.options import ReconOptions
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from recon.base.method import Progress
 from recon.prep.projections import Projections
+from recon.splatting.fit_method import Fit
 from recon.splatting.stream import StreamingFit
 
 
@@ -41,7 +41,8 @@ class LiveScan:
         begin: time at which the live fit began to wait for projections.
     """
 
-    options: ReconOptions
+    method: Fit
+    seed: int
     views: FollowedViews
     sink: Sink
     clock: Clock

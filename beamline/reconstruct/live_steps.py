@@ -143,9 +143,9 @@ def _new_fit(live: LiveScan, axis_col: float, again: bool) -> StreamingFit:
         ConfigError: the axis lies outside the detector.
     """
     check_axis(live.source, axis_col)
-    options, now = live.options, live.clock.now()
-    live.sink(ReconStarted(live.source.path, options.method.name, live.views.n, axis_col, again, time=now))
-    return options.streaming.stream(live.selection.geometry(axis_col, _ONE_VIEW), options.seed, live.clock.now)
+    method, now = live.method, live.clock.now()
+    live.sink(ReconStarted(live.source.path, method.name, live.views.n, axis_col, again, time=now))
+    return method.stream(live.selection.geometry(axis_col, _ONE_VIEW), live.seed, live.clock.now)
 
 
 def fed(live: LiveScan, state: Feeds, file: Cursor) -> tuple[Feeds, Cursor]:

@@ -21,6 +21,7 @@ from beamline.core.text import count
 from beamline.projections.prepared import PreparedProjections, hold_out
 from beamline.projections.replayed_frames import awaited, growing
 from beamline.projections.views import select
+from beamline.reconstruct.followed_views import FollowedViews
 from beamline.reconstruct.job import (
     Channels,
     Job,
@@ -33,6 +34,7 @@ from beamline.reconstruct.job import (
 )
 from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.live_reference import ReferencePictures
+from beamline.reconstruct.live_states import LiveScan
 from beamline.reconstruct.options import FollowTiming, ReconOptions
 from beamline.reconstruct.plan import ReconPlan, prepare_within, refuse_before_reading
 from beamline.reconstruct.record import partly_seen_warning, write_result
@@ -41,6 +43,7 @@ from beamline.reconstruct.region import Region, locate
 from beamline.reconstruct.run import fit_within, refuse_views, warnings_shown
 from beamline.reconstruct.scan_facts import MadeVolume, ReportContext, ScanFacts, facts_of
 from beamline.reconstruct.slab_run import keeping
+from beamline.reconstruct.snapshots import Snapshots
 from beamline.reconstruct.truth import fit_truth
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.open import NotReadyError, ScanSource, SourceOptions
@@ -76,7 +79,9 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
     _compile(options.target.live_picture, channels, timing)
     with channels.stop_scope() as should_stop:
         with _open(options.source, channels, timing) as source:
-            follower = ScanFollower(options, source, sink, clock, channels.warn)
+            views = FollowedViews(select(source, options.selection))
+            live = LiveScan(options.streaming, options.seed, views, sink, clock, channels.warn, begin=clock.now())
+            follower = ScanFollower(live, options.target)
             if _watch(follower, clock, timing, should_stop):
                 follower.catch_up(should_stop)
                 follower.draw_slices()
@@ -120,7 +125,9 @@ def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: Follow
         )
         drawn = None
         if options.reference is not None:
-            drawn = ReferencePictures(options, source, channels.sink, channels.clock, channels.warn)
+            views = FollowedViews(select(source, options.selection))
+            snapshots = Snapshots(options.target, views, channels.sink, channels.clock, channels.warn)
+            drawn = ReferencePictures(views, options.method, snapshots, channels.clock, channels.warn)
         for n_frames in growing(source, channels.clock, timing.patience, timing.poll):
             if drawn is not None and n_frames:
                 drawn.draw(None if source.finished else timing.picture)

@@ -19,9 +19,8 @@ from beamline.core.recon_events import SlicesDrawn, SnapshotWritten
 from beamline.core.sinks import Warnings
 from beamline.plan.plan import one_way
 from beamline.reconstruct.followed_views import FollowedViews
-from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.options import OutputPaths
 from beamline.report.live_picture import PictureRow, live_picture, slice_panels, volume_rows
-from beamline.storage.readers.base import ScanSource
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.recon_file import write_reconstruction
 from drivers.base.clock import Clock
@@ -40,24 +39,24 @@ from recon.voxels.view_weights import Wedge, unseen_wedges
 class Snapshots:
     """The files `<output>.snapshot.h5` and `<output>.live.png` of a followed scan."""
 
-    def __init__(self, options: ReconOptions, source: ScanSource, sink: Sink, clock: Clock, warn: Warnings) -> None:
-        self._options, self._source, self._sink, self._clock, self._warn = options, source, sink, clock, warn
+    def __init__(self, target: OutputPaths, views: FollowedViews, sink: Sink, clock: Clock, warn: Warnings) -> None:
+        self._source, self._sink, self._clock, self._warn = views.source, sink, clock, warn
         self._begin = clock.now()
-        self._sample = str(source.attributes.get("sample", "not stated"))
-        output = options.target.output
+        self._sample = str(views.source.attributes.get("sample", "not stated"))
+        output = target.output
         self.path: Path = output.with_name(f"{output.stem}.snapshot.h5")
-        self.picture_path = options.target.live_picture
+        self.picture_path = target.live_picture
         self.drawn = False  # True if the picture is of this scan
         self._slices: tuple[PictureRow, ...] = ()  # last drawn rows of the picture: FBP slices, and the volume
         self._grown: tuple[PictureRow, ...] = ()
         self._centre: Sequence[float] | None = None  # z, y and x of the FBP slices, at which the volume is also shown
         self._unseen: Wedge | None = None  # missing wedge of the projections of these slices
-        self.unit = "mm" if source.pixel_size_mm or options.selection.pixel_size_mm else "px"
+        self.unit = "mm" if views.scan.selection.pixel_size_mm else "px"
 
-    def write(self, fit: StreamingFit, axis_col: float) -> None:
+    def write(self, method_of_fit: str, fit: StreamingFit, axis_col: float) -> None:
         """Write the current volume and its picture, which replace the last ones."""
         shown = fit.best_preview()
-        (method, errors), unseen = self._method(shown), self._unseen
+        (method, errors), unseen = _method(method_of_fit, shown), self._unseen
         record = ReconRecord(
             volume=shown.volume,
             length_unit=self.unit,
@@ -113,14 +112,6 @@ class Snapshots:
         with suppress(PermissionError):  # Windows does not remove a file that a viewer has open
             self.path.unlink(missing_ok=True)
 
-    def _method(self, shown: BetterVolume) -> tuple[str, dict[str, float]]:
-        """The method of the volume that is shown. If two methods were compared, also their errors in held-out
-        projections.
-        """
-        fit, shown_errors = self._options.streaming.name, shown.errors
-        errors = {fit: shown_errors.fit, Fbp.name: shown_errors.direct} if math.isfinite(shown_errors.direct) else {}
-        return Fbp.name if shown.direct else fit, errors
-
     def _rows(self, fit: StreamingFit, volume: Volume, shown: str) -> tuple[PictureRow, ...]:
         elapsed = self._clock.now() - self._begin
         heading = (
@@ -132,6 +123,15 @@ class Snapshots:
     def _write_picture(self) -> None:
         write_whole(self.picture_path, live_picture((*self._slices, *self._grown)), replace=True)
         self.drawn = True
+
+
+def _method(fit: str, shown: BetterVolume) -> tuple[str, dict[str, float]]:
+    """The method of the volume that is shown. If two methods were compared, also their errors in held-out
+    projections.
+    """
+    of_fit, direct = shown.errors.fit, shown.errors.direct
+    errors = {fit: of_fit, Fbp.name: direct} if math.isfinite(direct) else {}
+    return Fbp.name if shown.direct else fit, errors
 
 
 def _why(errors: Mapping[str, float]) -> str:

@@ -11,10 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from beamline.core.events import Event
+from beamline.core.sinks import Warnings
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
+from beamline.projections.views import select
+from beamline.reconstruct.followed_views import FollowedViews
+from beamline.reconstruct.live_fit import ScanFollower
+from beamline.reconstruct.live_states import LiveScan
 from beamline.reconstruct.options import FollowTiming, OutputPaths, ReconOptions
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
@@ -117,3 +123,11 @@ def options(tmp_path: Path, **changes: object) -> ReconOptions:
 def close(clock: ScanClock) -> None:
     """Run the rest of the schedule."""
     clock.sleep(1e6)
+
+
+def follower_of(options: ReconOptions, clock: ScanClock, events: list[Event]) -> ScanFollower:
+    """Of the scan of these options, whose events are added to the list. Nobody closes its file."""
+    views = FollowedViews(select(options.source.open(follow=True), options.selection))
+    warn = Warnings(events.append, clock)
+    live = LiveScan(options.streaming, options.seed, views, events.append, clock, warn, begin=clock.now())
+    return ScanFollower(live, options.target)

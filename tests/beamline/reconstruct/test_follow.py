@@ -13,7 +13,6 @@ import pytest
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
-from beamline.core.sinks import Warnings
 from beamline.projections.selection import Selection
 from beamline.reconstruct import live_steps, snapshots
 from beamline.reconstruct.live_fit import ScanFollower
@@ -35,6 +34,7 @@ from tests.beamline.reconstruct.growing_scan import (
     SCAN,
     ScanClock,
     close,
+    follower_of,
     options,
     schedule,
 )
@@ -249,8 +249,7 @@ def _follower(folder: Path, clock: ScanClock, frames: list[Frame]) -> tuple[Scan
     schedule(clock, folder / "scan.h5", [replace(f, index=i) for i, f in enumerate(frames)], period=1.0)
     clock.sleep(1.0)
     wanted = options(folder, selection=Selection())
-    source = wanted.source.open(follow=True)
-    return ScanFollower(wanted, source, events.append, clock, Warnings(events.append, clock)), events
+    return follower_of(wanted, clock, events), events
 
 
 def test_it_waits_for_references_then_for_the_axis_then_feeds(tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ import pytest
 
 from beamline.core.events import Event
 from beamline.core.recon_events import LawMeasured
-from beamline.core.sinks import Warnings
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.projections.views import select
@@ -24,7 +23,17 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from drivers.base.frame import Frame, FrameKind
 from recon.base.error_law import ErrorLaw
 from recon.base.geometry import Geometry
-from tests.beamline.reconstruct.growing_scan import BRIEF, INTERLACED, SCAN, ScanClock, alarms, close, options, schedule
+from tests.beamline.reconstruct.growing_scan import (
+    BRIEF,
+    INTERLACED,
+    SCAN,
+    ScanClock,
+    alarms,
+    close,
+    follower_of,
+    options,
+    schedule,
+)
 from tests.beamline.scans import BEAM, frames_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -98,9 +107,7 @@ def follow(tmp_path: Path) -> Iterator[Callable[..., Followed]]:
         schedule(clock, tmp_path / "scan.h5", list(frames), period=1.0, passes=passes, **how)
         clock.sleep(1.0)
         wanted = options(tmp_path, **(changes or {}))
-        source = wanted.source.open(follow=True)
-        follower = ScanFollower(wanted, source, events.append, clock, Warnings(events.append, clock))
-        begun.append(Followed(clock, follower, events))
+        begun.append(Followed(clock, follower_of(wanted, clock, events), events))
         return begun[-1]
 
     yield begin

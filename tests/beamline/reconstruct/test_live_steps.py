@@ -40,7 +40,7 @@ from beamline.storage.readers.open import open_scan
 from drivers.base.frame import Frame, FrameKind
 from recon.base.method import Progress
 from recon.prep.align import AxisEstimate
-from tests.beamline.reconstruct.growing_scan import BRIEF, INTERLACED, SCAN, options
+from tests.beamline.reconstruct.growing_scan import BRIEF, INTERLACED, SCAN
 from tests.beamline.scans import frames_of, write_flagged
 from tests.clock import SteppedClock
 
@@ -62,9 +62,8 @@ def live(tmp_path: Path) -> Iterator[Callable[..., tuple[LiveScan, list[Event]]]
         events, clock = list[Event](), SteppedClock(tick=0.01)
         opened.append(open_scan(write_flagged(tmp_path / "scan.h5", list(frames), {})))
         views = FollowedViews(select(opened[-1], selection))
-        wanted = options(tmp_path, selection=selection, method=BRIEF)
         warn = Warnings(events.append, clock)
-        return LiveScan(wanted, views, events.append, clock, warn, clock.now()), events
+        return LiveScan(BRIEF, 0, views, events.append, clock, warn, clock.now()), events
 
     yield make
     for source in opened:
