@@ -38,7 +38,7 @@ COST, USUAL_FURTHER = 3, 30
 """Time of an iteration on half voxels, divided by that of an iteration on whole voxels (2.5 to 4.5 for 16 rows, up to
 6.6 for 8 rows), and usual number of iterations on half voxels.
 """
-_DUAL_STEPS = 2
+DUAL_STEPS = 2
 """Factor on the dual steps of each proximal step.
 
 The smoothing of total variation must cross twice as many half voxels as whole ones. With 3 dual steps on half voxels,
@@ -50,7 +50,8 @@ rows they take up to a third more.
 _FEW, _MOST_COLUMNS, _WIDEST, _LEAST_WIDTH, _AS_WIDE = 1 / 3, 1024, 2.2, 0.75, 0.1
 # copies of half-voxel volumes: a quarter for the volume of whole voxels, the rest for the coarse cells of damping
 _MORE_VOLUMES = 0.6
-_BY_QUALITY: dict[Quality, bool | None] = {"preview": False, "standard": None, "best": True}
+BY_QUALITY: dict[Quality, bool | None] = {"preview": False, "standard": None, "best": True}
+"""Whether the last iterations use half voxels, for each preset; None: see `uses_half_voxels`."""
 
 
 class HalfVoxels(VoxelMethod):
@@ -83,7 +84,7 @@ class HalfVoxels(VoxelMethod):
         """For "best", the method ends nearer to the minimum and uses half voxels; for "preview", it ends farther from
         the minimum.
         """
-        changed, wanted = with_quality(self, quality), _BY_QUALITY[quality]
+        changed, wanted = with_quality(self, quality), BY_QUALITY[quality]
         return changed if wanted is None else with_halves(changed, wanted)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
@@ -114,16 +115,15 @@ class HalfVoxels(VoxelMethod):
         if not self.halves(projector.geometry, projector.grid):
             return x
         before = 0 if decide.ended is None else decide.ended.after
-        fine, start = _with_half_voxels(problem, first + before), np.repeat(np.repeat(x, 2, axis=0), 2, axis=1)
+        fine, start = with_half_voxels(problem, first + before), repeated(x)
         on_halves = ordered_fista(
             fine, start, TvWeight(mu / 2), subsets_on_halves(fine), sweeps=self.iterations,
-            prox=tv_prox(fine, _DUAL_STEPS * tv_steps), pull=None if pull is None else pull(fine, start),
+            prox=tv_prox(fine, DUAL_STEPS * tv_steps), pull=None if pull is None else pull(fine, start),
             still=self.still,
         )  # fmt: skip
         if (ended := decide.ended) is not None:
             decide.ended = ended._replace(after=before + ended.after, on_half_voxels=ended.after)
-        ny, nx, nz = x.shape
-        return on_halves.reshape(ny, 2, nx, 2, nz).mean(axis=(1, 3), dtype=np.float32)
+        return means_of_four(on_halves)
 
 
 def with_halves(method: MethodT, wanted: bool) -> MethodT:
@@ -169,7 +169,18 @@ def halved(grid: Grid) -> Grid:
     return Grid((nz, 2 * ny, 2 * nx), grid.voxel_size / 2, grid.centre, grid.spacing[0])
 
 
-def _with_half_voxels(problem: VoxelProblem, done: int) -> VoxelProblem:
+def repeated(x: F32) -> F32:
+    """The volume x [y, x, z] of whole voxels on half voxels: four equal ones in each voxel."""
+    return np.repeat(np.repeat(x, 2, axis=0), 2, axis=1)
+
+
+def means_of_four(x: F32) -> F32:
+    """The volume x [y, x, z] of half voxels on whole voxels: the mean of the four in each voxel."""
+    ny, nx, nz = x.shape
+    return x.reshape(ny // 2, 2, nx // 2, 2, nz).mean(axis=(1, 3), dtype=np.float32)
+
+
+def with_half_voxels(problem: VoxelProblem, done: int) -> VoxelProblem:
     """The problem with half voxels, whose iterations follow `done` iterations on whole ones."""
     projector = replace(problem.projector, grid=halved(problem.projector.grid))
     data = smoothed(problem.views, projector.resolution, None if problem.weight is None else problem.weight > 0)

@@ -21,6 +21,7 @@ from recon.base.volume import Volume
 from recon.features.reference.fit import PLAN, StateFit
 from recon.features.reference.motion import KNOTS, Basis, MotionViews, Moved, affinely_moved, padded, roughly_moved
 from recon.features.reference.particles import particles_of, placed
+from recon.features.reference.weights import CLEAR_LINES
 from recon.voxels.choice import (
     LEAST_GAIN,
     MEASURE,
@@ -187,7 +188,7 @@ def _best_weight(trial: Trial, fit: StateFit) -> BestStrength | None:
 
     def residuals_of(weight: float) -> F64:
         other = fit.again(weight, fit.x)
-        other.sharpen(1)
+        other.sharpen(1, lines_from=CLEAR_LINES)
         return trial.residuals(other.x)
 
     return preferred_strength(residuals_of, fit.weight)
@@ -199,7 +200,7 @@ def _without(trial: Trial, fit: StateFit, smooth: F32, mu: float) -> BestStrengt
     def residuals_of(weight: float) -> F64:
         other = fit.again(weight, smooth)
         other.alone()
-        other.sharpen(1)
+        other.sharpen(1, lines_from=CLEAR_LINES)
         return trial.residuals(other.x)
 
     return preferred_strength(residuals_of, mu)

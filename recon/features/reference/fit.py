@@ -21,8 +21,9 @@ from scipy import ndimage as ndi
 from recon.base.arrays import F32
 from recon.base.decisions import GoesOn
 from recon.features.reference.motion import KNOTS, Basis, MotionViews, Moved, improved
-from recon.features.reference.weights import falling
+from recon.features.reference.weights import ALL_LINES, falling
 from recon.kernels.cpu.two_tv import ascend, pace_of, primal
+from recon.voxels.half_voxels import DUAL_STEPS, means_of_four, repeated, subsets_on_halves, with_half_voxels
 from recon.voxels.ordered_fista import SUBSETS, Subsets, ordered_fista, subsets_of
 from recon.voxels.priors import TvWeight
 from recon.voxels.voxel_problem import VoxelProblem, difference_weights
@@ -44,15 +45,17 @@ class TwoVariations:
     The dual fields are kept from one call to the next, also if m changes. Memory: 8 volumes in addition to m, a and b.
     """
 
-    def __init__(self, shape: tuple[int, int, int], weights: tuple[float, float, float], nonnegative: bool) -> None:
-        self._weights, self._nonnegative = weights, nonnegative
+    def __init__(
+        self, shape: tuple[int, ...], weights: tuple[float, float, float], nonnegative: bool, steps: int = _STEPS
+    ) -> None:
+        self._weights, self._nonnegative, self._steps = weights, nonnegative, steps
         self._fields = np.zeros((3, *shape), np.float32), np.zeros((3, *shape), np.float32)
         self._start, self._beside = np.empty(shape, np.float32), np.empty(shape, np.float32)
         self.m = self.own = self.change = self._start
 
     def copy(self) -> TwoVariations:
         """A copy with separate dual fields."""
-        other = TwoVariations(self._start.shape, self._weights, self._nonnegative)
+        other = TwoVariations(self._start.shape, self._weights, self._nonnegative, self._steps)
         other._fields = self._fields[0].copy(), self._fields[1].copy()
         return other
 
@@ -69,7 +72,7 @@ class TwoVariations:
         given = self._start, self._fields, self.m, threshold, self._weights, self._nonnegative, (x, self._beside)
         pace = pace_of(threshold, self._weights)
         primal(*given)
-        for _ in range(_STEPS):
+        for _ in range(self._steps):
             ascend(x, self.own, pace, self._weights, self._fields[0])
             ascend(self._beside, self.change, pace, self._weights, self._fields[1])
             primal(*given)
@@ -122,17 +125,11 @@ class StateFit:
         """Leave out the reference. Both weights then apply to the total variation of x."""
         self.m, self.known = np.zeros_like(self.m), np.ones_like(self.known)
 
-    def solve(
-        self, own: F32 | float = 1.0, change: F32 | float = 1.0, still: float = _STILL, most: int = _MOST
-    ) -> None:
+    def solve(self, own: F32 | float = 1.0, change: F32 | float = 1.0, most: int = _MOST) -> None:
         """Improve x. `own` and `change` are factors [y, x, z] on the two weights."""
         if not self.going.going:
             return
-        own, change = (np.broadcast_to(np.asarray(w, np.float32), self.x.shape) for w in (own, change))
-        # In voxels that the reference does not show, and in differences to such voxels, both weights apply to x.
-        inner = ndi.binary_erosion(self.known, border_value=1)
-        a = np.where(inner, np.float32(OWN) * own, np.float32(OWN + 1) * own).astype(np.float32)
-        self._prox.about(self.m, a, np.where(inner, change, np.float32(0)).astype(np.float32))
+        self._prox.about(self.m, *self._weights(own, change))
         done = self._done
 
         def go_on(sweep: int, residual: float) -> bool:
@@ -141,8 +138,16 @@ class StateFit:
 
         self.x = ordered_fista(
             replace(self.problem, go_on=GoesOn(go_on)), self.x, TvWeight(self.weight), self._subsets, sweeps=most,
-            prox=self._prox, still=still,
+            prox=self._prox, still=_STILL,
         )  # fmt: skip
+
+    def _weights(self, own: F32 | float, change: F32 | float) -> tuple[F32, F32]:
+        """The weights a and b [y, x, z], for these factors on the two weights."""
+        own, change = (np.broadcast_to(np.asarray(w, np.float32), self.x.shape) for w in (own, change))
+        # In voxels that the reference does not show, and in differences to such voxels, both weights apply to x.
+        inner = ndi.binary_erosion(self.known, border_value=1)
+        a = np.where(inner, np.float32(OWN) * own, np.float32(OWN + 1) * own).astype(np.float32)
+        return a, np.where(inner, change, np.float32(0)).astype(np.float32)
 
     def follow(self, steps: Sequence[tuple[int, float]]) -> None:
         """Improve the gains from x, then the motion from the projections.
@@ -173,13 +178,34 @@ class StateFit:
             self.follow(steps)
             self.solve(most=most)
 
-    def sharpen(self, rounds: int, still: float = _STILL, most: int = _MOST) -> None:
+    def sharpen(self, rounds: int, most: int = _MOST, lines_from: float = ALL_LINES) -> None:
         """Improve the volume in rounds in which the weights are lower where the change is steep, and along dark lines
-        in particles.
+        in particles. `lines_from` is explained in `falling`.
         """
         for _ in range(rounds):
-            own, change = falling(self.problem, self.moved, self.x, self.m)
-            self.solve(own, change, still, most)
+            own, change = falling(self.problem, self.moved, self.x, self.m, lines_from)
+            self.solve(own, change, most)
+
+    def on_half_voxels(self, most: int = _MOST) -> int:
+        """Improve the volume once more as `sharpen` does, but on half voxels, see `recon.voxels.half_voxels`.
+
+        The moved reference and the weights are the same in the four half voxels of a voxel.
+
+        Returns:
+            The number of iterations; 0 if the fit was stopped before.
+        """
+        if not self.going.going:
+            return 0
+        own, change = self._weights(*falling(self.problem, self.moved, self.x, self.m))
+        fine, x = with_half_voxels(self.problem, self._done), repeated(self.x)
+        weights = difference_weights(fine.projector.grid)
+        prox = TwoVariations(x.shape, weights, fine.nonnegative, DUAL_STEPS * _STEPS)
+        prox.about(repeated(self.m), repeated(own), repeated(change))
+        subsets = subsets_on_halves(fine)
+        x = ordered_fista(fine, x, TvWeight(self.weight / 2), subsets, sweeps=most, prox=prox, still=_STILL)
+        self.x = means_of_four(x)
+        ended = self.problem.decide.ended
+        return 0 if ended is None else ended.after
 
 
 def gains_of(x: F32, moved: Moved) -> NDArray[np.float64]:

@@ -21,6 +21,7 @@ from recon.features.reference.motion import KNOTS, Basis, padded
 from recon.features.reference.particles import bytes_placed, require_finite
 from recon.features.reference.preview import preview_of
 from recon.voxels.choice import TrialChoice
+from recon.voxels.half_voxels import BY_QUALITY, COST, halved, uses_half_voxels
 from recon.voxels.iterative import solve_views, watched
 from recon.voxels.projector import Projector, volume_slices
 from recon.voxels.trial import Trial
@@ -33,6 +34,7 @@ _AT_FIRST = Buffers(8.0, 3.0, 3.5)  # when the reference is put on the voxels
 # Peaks measured, in volumes: 54 in a slab of 16 rows, with 48 rows of the reference; 42 in 64 rows that all of the
 # reference is in.
 _BUFFERS, _PLACED = Buffers(40.0, 7.0, 3.5, filtered=True), 5
+_ON_HALVES, _PLACED_LATER = Buffers(26.0, 7.0, 3.5), 3  # copies of volumes of half voxels
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +53,7 @@ class FromReference(Method):
     Attributes:
         reference: the earlier volume, in 1/mm, in the coordinates of its own scan; None: there is no reference.
         otherwise: the method that is used if the reference is not.
+        half_voxels: whether the last iterations use half voxels; None: see `uses_half_voxels`.
     """
 
     name: ClassVar[str] = "from-reference"
@@ -61,6 +64,7 @@ class FromReference(Method):
 
     reference: Volume | None = None
     otherwise: Auto = field(default_factory=Auto)
+    half_voxels: bool | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -108,14 +112,15 @@ class FromReference(Method):
         """The volume with the reference; None: this part of a volume is where the reference shows no material."""
         assert self.reference is not None and control.decide is not None
         begin, history = control.now(), list[Progress]()
-        planned = (1 + len(_ROUNDS)) * _FIRST + _SHARPER * _LAST
+        halves = uses_half_voxels(self.half_voxels, problem.geometry, problem.grid)
+        planned = (1 + len(_ROUNDS)) * _FIRST + (_SHARPER + COST * halves) * _LAST
 
         def report(iteration: int, residual: float) -> None:
             seconds = control.now() - begin
             history.append(Progress(iteration, planned, seconds, residual, residual, 0, problem.geometry.n_views))
             control.tell(history[-1])
 
-        state, decide = _State(self.reference, verdict), control.decide
+        state, decide = _State(self.reference, verdict, halves), control.decide
         projector = Projector(problem.geometry, problem.grid)
         volume = solve_views(
             state, projector, problem.views.masked(), nonnegative=not self.allow_negative,
@@ -146,8 +151,9 @@ class FromReference(Method):
         )
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """The same as for `otherwise`."""
-        return replace(self, otherwise=self.otherwise.with_quality(quality, default_count))
+        """The same as for `otherwise`; half voxels always with "best", and never with "preview"."""
+        otherwise = self.otherwise.with_quality(quality, default_count)
+        return replace(self, otherwise=otherwise, half_voxels=BY_QUALITY[quality])
 
     def toy(self) -> Self:
         return replace(self, otherwise=self.otherwise.toy())
@@ -157,6 +163,9 @@ class FromReference(Method):
         placed, smoothed = bytes_placed(given, grid, MARGIN)
         at_first = bytes_of(_AT_FIRST, geometry, grid, weighted) + placed + smoothed
         later = bytes_of(_BUFFERS, geometry, grid, weighted) + _PLACED * placed
+        if uses_half_voxels(self.half_voxels, geometry, grid):
+            on_halves = bytes_of(_ON_HALVES, geometry, halved(grid), weighted)
+            later = max(later, on_halves + _PLACED_LATER * placed)
         return own + max(at_first, later, self.otherwise.memory(geometry, grid, weighted))
 
 
@@ -169,8 +178,8 @@ class _State:
             value.
     """
 
-    def __init__(self, reference: Volume, verdict: ReferenceVerdict) -> None:
-        self._reference, self._verdict = reference, verdict
+    def __init__(self, reference: Volume, verdict: ReferenceVerdict, halves: bool) -> None:
+        self._reference, self._verdict, self._halves = reference, verdict, halves
         self.moved = self.displacement = np.empty(0, np.float32)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
@@ -197,6 +206,8 @@ class _State:
         fit = StateFit(problem, moved, start.astype(np.float32), weight, width)
         fit.rounds(_ROUNDS, _FIRST)
         fit.sharpen(_SHARPER, most=_LAST)
+        if self._halves and (count := fit.on_half_voxels(most=_LAST)):
+            problem.decide.settings["half_voxel_iterations"] = count
         problem.decide.ended = None  # it describes only the last of several rounds
         self.moved = volume_slices(times_power(fit.m.copy(), problem.units.density))
         self.displacement = np.float32(edge) * fit.moved.u[[2, 0, 1]].transpose(0, 3, 1, 2)
