@@ -189,7 +189,8 @@ class StateFit:
     def on_half_voxels(self, most: int = _MOST) -> int:
         """Improve the volume once more as `sharpen` does, but on half voxels, see `recon.voxels.half_voxels`.
 
-        The moved reference and the weights are the same in the four half voxels of a voxel.
+        The moved reference and the weights are the same in the four half voxels of a voxel. This ends the fit: the
+        memory of the whole voxels is given back.
 
         Returns:
             The number of iterations; 0 if the fit was stopped before.
@@ -201,6 +202,7 @@ class StateFit:
         weights = difference_weights(fine.projector.grid)
         prox = TwoVariations(x.shape, weights, fine.nonnegative, DUAL_STEPS * _STEPS)
         prox.about(repeated(self.m), repeated(own), repeated(change))
+        del self._prox, own, change
         subsets = subsets_on_halves(fine)
         x = ordered_fista(fine, x, TvWeight(self.weight / 2), subsets, sweeps=most, prox=prox, still=_STILL)
         self.x = means_of_four(x)

@@ -34,7 +34,7 @@ _AT_FIRST = Buffers(8.0, 3.0, 3.5)  # when the reference is put on the voxels
 # Peaks measured, in volumes: 54 in a slab of 16 rows, with 48 rows of the reference; 42 in 64 rows that all of the
 # reference is in.
 _BUFFERS, _PLACED = Buffers(40.0, 7.0, 3.5, filtered=True), 5
-_ON_HALVES, _PLACED_LATER = Buffers(26.0, 7.0, 3.5), 3  # copies of volumes of half voxels
+_ON_HALVES = Buffers(20.0, 7.0, 3.5)  # in volumes of half voxels
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +47,8 @@ class FromReference(Method):
     Held-out projections decide whether the reference is used. If it is not used, or if there are fewer than 16
     projections, the volume is exactly the volume of the method `otherwise`.
 
-    Memory: the reference, 40 volumes, 7 times the projections, and 5 times the part of the reference that is used: up
-    to 16 voxels beyond the volume on each side.
+    Memory: the reference, 40 volumes (with half voxels 80), 7 times the projections, and 5 times the part of the
+    reference that is used: up to 16 voxels beyond the volume on each side.
 
     Attributes:
         reference: the earlier volume, in 1/mm, in the coordinates of its own scan; None: there is no reference.
@@ -165,7 +165,7 @@ class FromReference(Method):
         later = bytes_of(_BUFFERS, geometry, grid, weighted) + _PLACED * placed
         if uses_half_voxels(self.half_voxels, geometry, grid):
             on_halves = bytes_of(_ON_HALVES, geometry, halved(grid), weighted)
-            later = max(later, on_halves + _PLACED_LATER * placed)
+            later = max(later, on_halves + _PLACED * placed)
         return own + max(at_first, later, self.otherwise.memory(geometry, grid, weighted))
 
 

@@ -10,7 +10,7 @@ import pytest
 from recon.features.reference.fit import TwoVariations, gains_of
 from recon.features.reference.motion import Moved
 from recon.features.reference.particles import particles_of
-from recon.features.reference.weights import line_contrast
+from recon.features.reference.weights import line_contrast, whole_lines
 from tests.recon.features.reference.scene import packed
 
 
@@ -74,3 +74,18 @@ def test_a_line_is_darker_than_its_sides_only_along_it(turn: float) -> None:
     across = np.where(np.abs(j * np.sin(turn) + i * np.cos(turn)) < 0.5, -1.0, 0.0)
     assert (stencil * line).sum() > 0.6
     assert abs((stencil * across).sum()) < 0.15
+
+
+def test_faint_parts_of_a_line_count_only_with_its_dark_part() -> None:
+    dark = np.zeros((12, 12, 3), np.float32)
+    dark[3, 1:10, 1] = 2.0  # faint along all of its length, and dark in one voxel
+    dark[3, 5, 1] = 4.0
+    dark[4, 10, 2] = 1.8  # touches its end
+    dark[8, 1:10, 1] = 2.5  # nowhere dark enough
+    expected = dark.copy()
+    expected[8] = 0
+    np.testing.assert_array_equal(whole_lines(dark, 1.5), expected)
+    clear = np.zeros_like(dark)
+    clear[3, 5, 1] = 4.0
+    np.testing.assert_array_equal(whole_lines(dark, 3.0), clear)
+    assert not whole_lines(np.zeros_like(dark), 1.5).any()

@@ -118,11 +118,37 @@ def test_weights_of_rays_are_used(before: Volume, state: tuple[F32, recon.Geomet
     )
 
 
+def test_the_last_iterations_use_half_voxels_as_without_a_reference(
+    before: Volume, state: tuple[F32, recon.Geometry]
+) -> None:
+    """24 projections of 64 columns are too many; the setting, or the preset "best", asks for half voxels."""
+    method = recon.FromReference(before, AUTO)
+    decide = Decisions()
+    whole = recon.reconstruct(*state, method, control=RunControl(decide=decide))
+    assert whole.settings["reference_used"] and "half_voxel_iterations" not in whole.settings
+    halves = recon.reconstruct(
+        *state, replace(method, half_voxels=True), control=RunControl(decide=Decisions(0, decide.made))
+    )
+    assert 0 < halves.settings["half_voxel_iterations"] <= 12
+    assert halves.history[-1].step > whole.history[-1].step
+    assert halves.volume.data.shape == whole.volume.data.shape
+    assert psnr(halves.volume.data, STATE.volume) > psnr(whole.volume.data, STATE.volume) + 0.1
+    grid, geometry = halves.volume.grid, state[1]
+    few = replace(geometry, angles=geometry.angles[:20])
+    assert method.memory(few, grid, False) > 1.4 * method.memory(geometry, grid, False)
+    wanted = {quality: method.with_quality(quality, 0).half_voxels for quality in ("preview", "standard", "best")}
+    assert wanted == {"preview": False, "standard": None, "best": True}
+
+
 @pytest.mark.parametrize(
-    "rows, beyond, weighted", others_slow([(16, 16, False), (16, 16, True), (64, 16, False), (64, 16, True)], 1)
-)
+    "rows, beyond, weighted, halves",
+    others_slow(
+        [(16, 16, False, False), (16, 16, True, False), (64, 16, False, False), (64, 16, True, False),
+         (16, 16, False, True), (64, 16, True, True)], 1
+    ),
+)  # fmt: skip
 def test_the_stated_memory_is_at_least_the_peak_of_a_slab(
-    rows: int, beyond: int, weighted: bool, before: Volume, state: tuple[F32, recon.Geometry]
+    rows: int, beyond: int, weighted: bool, halves: bool, before: Volume, state: tuple[F32, recon.Geometry]
 ) -> None:
     """A slab, with rows of the reference beyond it. The first slab makes the tests, the others do not."""
     data, geometry = state
@@ -132,7 +158,7 @@ def test_the_stated_memory_is_at_least_the_peak_of_a_slab(
     density = np.random.default_rng(0).uniform(0.8, 1.2, rows + 2 * beyond).astype(np.float32)
     tall = np.tile(before.data, (len(density) // ROWS, 1, 1)) * density[:, None, None]
     lines = np.tile(data, (1, rows // ROWS, 1)) * density[beyond : beyond + rows, None]
-    method = recon.FromReference(Volume(tall, Grid(tall.shape, before.grid.voxel_size)), AUTO)
+    method = recon.FromReference(Volume(tall, Grid(tall.shape, before.grid.voxel_size)), AUTO, halves)
     weights = np.ones((len(data), *shape), np.float32) if weighted else None
     problem = ReconProblem(Views(lines, slab, weights), Grid.matching(slab))
     method.run(problem, RunControl())  # loads kernels
