@@ -407,7 +407,7 @@ class Config(Section):
         if twice := [text for text in texts if texts.count(text) > 1]:
             repeated = twice[0]
             raise ValueError(
-                f"scan.energies lists {repeated} keV twice (compared to seven digits); give each energy once"
+                f"scan.energies lists {repeated} keV twice (rounded to seven digits); give each energy once"
             )
         return self
 

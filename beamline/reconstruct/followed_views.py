@@ -70,7 +70,7 @@ _FIRST_VIEWS = 12  # fewer projections do not determine an axis
 _UNKNOWN = (
     "If you know the rotation axis, use --axis COLUMN, or optics.axis_col in the configuration of later scans. The "
     "projections do not show the axis yet, because the sample is wider than the field of view; after 180° the axis "
-    "can be found. Until then the slices use the middle of the detector as axis, and the volume does not start."
+    "can be found. Until then the slices use the middle of the detector as axis, and no volume is computed."
 )
 
 

@@ -118,7 +118,9 @@ class Travel:
     def cannot_emit(self, train: TriggerTrain, why: str = "", advice: str = "") -> DeviceRefused:
         """The error for a train that the stage cannot emit; the message states the conditions for trains."""
         unit, least = self.limits.interval_unit, least_interval(self.limits)
-        multiple = f" apart by a multiple of {unit} counts (a toggled output: an even number)," if unit > 1 else ""
+        multiple = (
+            f" apart by a multiple of {unit} counts (if the output toggles: by an even multiple)," if unit > 1 else ""
+        )
         return DeviceRefused(
             self.name,
             f"{train.n} pulses every {train.interval} counts from {self.degrees(train.start)} cannot be emitted{why}",

@@ -96,8 +96,8 @@ class R2(Fit):
         """The residuals of the method's volume in the held-out projections.
 
         Usually the test of the fit makes a quarter of the steps, and makes all steps only if a quarter does not decide
-        whether the fit is best, see `trial_fit.predict`. The test runs the method unchanged, with its own end and voxel
-        refinement, in these cases: `finish`, `seconds` or `early_stop` is set; the fit starts from given Gaussians; the
+        whether the fit is best, see `trial_fit.predict`. The test runs the whole method unchanged, with its
+        stopping rule and its voxel refinement, in these cases: `finish`, `seconds` or `early_stop` is set; the fit starts from given Gaussians; the
         trial could not choose a regularisation weight.
         """
         by_other_settings = self.finish is not None or self.seconds is not None or isinstance(self.gaussians, Gaussians)

@@ -118,7 +118,7 @@ def check_air_level(scan: ScanEvidence, level: float, air: bool, accepted: bool 
         what = (
             "this difference is subtracted as a change of the beam"
             if air
-            else "this difference is not subtracted, because no air is known next to the sample"
+            else "this difference is not subtracted, because it is not known which pixels next to the sample show air"
         )
         factor = math.exp(abs(level))
         dark_or_bright = "dark" if level > 0 else "bright"

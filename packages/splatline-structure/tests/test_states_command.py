@@ -134,7 +134,7 @@ def test_a_state_of_another_sample_is_told_and_alone_it_is_refused(here: Path, m
     assert result.exit_code == 0 and "state_b.h5 shows another sample than good.h5" in result.stderr
     assert {row["verdict"] for row in rows(here / "out/particles.csv") if row["state"] == "state_b.h5"} == {"not seen"}
     result = beamline("structure", "--states", "good.h5", *STATES, "-o", "none")
-    assert result.exit_code == 5 and "No state shows the sample of good.h5" in result.stderr
+    assert result.exit_code == 5 and "No scan of a state shows the sample of the reference good.h5" in result.stderr
     assert not (here / "none").exists()
 
 

@@ -56,7 +56,7 @@ class Materials:
         y, x], 0 to 1. For example, the share of a charged material is the state of charge of a battery electrode.
 
         Args:
-            least: smallest sum of the densities of the materials `of` and `others` for which a share is computed.
+            least: a share is computed where the densities of all these materials add up to this value or more.
                 Voxels with a smaller sum of densities get NaN.
         """
         part = self.densities[of]

@@ -166,7 +166,7 @@ def test_a_dry_run_counts_all_energies(config: Path, tmp_path: Path) -> None:
     ("words", "said"),
     [
         (("scan.energies=[8.3, 8.3]",), "lists 8.3 keV twice"),
-        (("scan.energies=[8.3, 8.30000000001]",), "keV twice (compared to seven digits)"),
+        (("scan.energies=[8.3, 8.30000000001]",), "keV twice (rounded to seven digits)"),
         (("scan.energy=8.3",), "exclude each other"),
         (("devices.monochromator={kind: none}",), "scan.energies needs a monochromator"),
         (("devices.monochromator={kind: simulated, range_kev: [8, 8.35]}",), "8.352 keV is not within"),
