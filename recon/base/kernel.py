@@ -76,7 +76,7 @@ class Kernel(StrEnum):
         return (2 / 3, 4 / 3, 10 / 3, 256 / 21) if self.is_compact else (1 / 2, 1.0, 3 / 2, 6.0)
 
     def reach(self, sigmas: float) -> float:
-        """Radius in standard deviations beyond which the kernel is 0: `sigmas` for a Gaussian, which is cut off there."""
+        """Radius in standard deviations beyond which the kernel is 0: `sigmas` for a Gaussian, which is cut off."""
         return self.radius if self.is_compact else sigmas
 
 

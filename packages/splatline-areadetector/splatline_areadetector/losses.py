@@ -91,21 +91,23 @@ def first_or_last_sentence(plan: RidePlan, sorter: Sorter, *, ended: bool) -> st
     angles, basis, n = plan.angles, sorter.basis, sorter.n_left
     if n == 0 or basis.is_sure or (basis is Basis.WAITED and not ended):
         return ""
-    off = f"the true angle of each projection is that of the projection {n} places later"
+    wrong = f"the true angle of each projection is the stated angle of the projection {n} places later"
     if n < angles.size and not np.isnan(angles).any():
-        off = f"all angles are {math.degrees(angles[n] - angles[0]):.4g}° larger than stated"
+        wrong = f"all angles are {math.degrees(angles[n] - angles[0]):.4g}° larger than stated"
     has_angles = plan.angle_source == "attribute"
     if sorter.is_by_order and len(plan.blocks) > 1:
-        off = "" if has_angles else f", and {off}"
-        off = (
-            "the first and last frames of each block are stored with the kind of the neighbouring block"
-            f"{off}. Set ride.kinds"
+        also = "" if has_angles else f", and {wrong}"
+        wrong, key = (
+            "the first and last frames of each block are stored as frames of the neighbouring block (dark, flat "
+            f"or projection){also}",
+            "ride.kinds",
         )
     elif has_angles:
         return ""
     else:
-        off = f"{off}, which rotates the volume and changes nothing else. Set ride.camera"
+        wrong, key = f"{wrong}, which rotates the volume and changes nothing else", "ride.camera"
+    missing = "frame" if n == 1 else f"{n} frames"
     return (
-        f"The number of the first projection is not known, so the missing {'frame' if n == 1 else f'{n} frames'} "
-        f"may be the first of the scan. If so, {off} or ride.first_id to avoid this."
+        f"The number of the first projection is not known, so the missing {missing} may be the first of the scan. "
+        f"If so, {wrong}. Set {key} or ride.first_id, so that the number of the first projection is known."
     )

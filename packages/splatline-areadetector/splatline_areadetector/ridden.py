@@ -313,37 +313,6 @@ class RiddenFrames:
         words += self._losses.sentences(self._guide.status, self._ride.counters, self._sorter.repeats)
         return "".join(f" {sentence}" for sentence in words if sentence)
 
-    def _first_or_last(self, ended: bool) -> str:
-        """A sentence on frames that are missing at the end. "" if the number of the first projection is known, or if
-        the recording began before the scan and was stopped while frames came, because that explains the missing frames.
-
-        The projections cannot show whether the first frames are missing: if all angles are wrong by a constant, the
-        projections agree with a rotated sample.
-        """
-        angles, basis, n = self._plan.angles, self._sorter.basis, self._sorter.n_left
-        if n == 0 or not self._views or basis.is_sure or (basis is Basis.WAITED and not ended):
-            return ""
-        wrong = f"the true angle of each projection is the stated angle of the projection {n} places later"
-        if n < angles.size and not np.isnan(angles).any():
-            wrong = f"all angles are {math.degrees(angles[n] - angles[0]):.4g}° larger than stated"
-        has_angles = self._plan.angle_source == "attribute"
-        if self._sorter.is_by_order and len(self._plan.blocks) > 1:
-            also = "" if has_angles else f", and {wrong}"
-            wrong, key = (
-                "the first and last frames of each block are stored as frames of the neighbouring block (dark, flat "
-                f"or projection){also}",
-                "ride.kinds",
-            )
-        elif has_angles:
-            return ""
-        else:
-            wrong, key = f"{wrong}, which rotates the volume and changes nothing else", "ride.camera"
-        missing = "frame" if n == 1 else f"{n} frames"
-        return (
-            f"The number of the first projection is not known, so the missing {missing} may be the first of the scan. "
-            f"If so, {wrong}. Set {key} or ride.first_id, so that the number of the first projection is known."
-        )
-
     def _raise_outcome(self) -> None:
         since = math.inf if self._arrived is None else time.time() - self._arrived.received
         ended = not (

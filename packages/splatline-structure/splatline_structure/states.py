@@ -122,7 +122,8 @@ def measure_states(paths: Sequence[Path], output: Path, answer: Answer, values: 
             )
     if not any(state.matches for state in states):
         raise DataError(
-            f"No scan of a state shows the sample of the reference {first}. Give a reference of the same sample. Nothing was written."
+            f"No scan of a state shows the sample of the reference {first}. Give a reference of the same sample. "
+            "Nothing was written."
         )
     series = Series(first, record, reference, labels, states, across)
     _write(series, output, values, answer)

@@ -153,8 +153,8 @@ def fit_series(
     gets a countdown of the steps that fit the factors. If `go_on` ends the fit of the factors early, the result is the
     volumes without factors.
 
-    Use `motion=True` for a sample that settles. If only the densities of the sample change, `motion=True` finds motion that
-    does not exist. For a sample that does not change, `tv_weight` has the same effect as the same weight for a single
+    Use `motion=True` for a sample that settles. If only the densities of the sample change, `motion=True` finds motion
+    that does not exist. For a sample that does not change, `tv_weight` has the same effect as the same weight for a single
     volume from all projections.
 
     Args:
