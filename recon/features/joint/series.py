@@ -154,8 +154,8 @@ def fit_series(
     volumes without factors.
 
     Use `motion=True` for a sample that settles. If only the densities of the sample change, `motion=True` finds motion
-    that does not exist. For a sample that does not change, `tv_weight` has the same effect as the same weight for a single
-    volume from all projections.
+    that does not exist. For a sample that does not change, `tv_weight` has the same effect as the same weight for a
+    single volume from all projections.
 
     Args:
         knots: number of volumes, 2 or more.

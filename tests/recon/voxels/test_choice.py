@@ -131,11 +131,11 @@ def test_levels_that_passed_their_tests_are_taken_even_if_they_gain_little(
     discrete: float, patches: float | None, taken: str, suffice: bool
 ) -> None:
     levels = Prior(1.0, materials=MaterialPrior((0.0, 1.0), (0.5, 0.5), 1.0, 0.02, 0.1))
-    choice = TrialChoice("16 rows").after(Prediction("fbp", 3 + SCATTER))
-    choice = choice.after(Prediction("fista-tv", 1 + SCATTER, Prior(1.0)))
-    choice = choice.after(Prediction("discrete", discrete + SCATTER, levels))
+    choice = TrialChoice("16 rows").after(Prediction("fbp", (3 + SCATTER).tolist()))
+    choice = choice.after(Prediction("fista-tv", (1 + SCATTER).tolist(), Prior(1.0)))
+    choice = choice.after(Prediction("discrete", (discrete + SCATTER).tolist(), levels))
     assert choice.levels_suffice is suffice
-    choice = choice.after(Prediction("pnp-dct", None if patches is None else patches + SCATTER))
+    choice = choice.after(Prediction("pnp-dct", None if patches is None else (patches + SCATTER).tolist()))
     assert choice.chosen is not None and choice.predictions[choice.chosen].name == taken
     without = choice._replace(predictions=(*choice.predictions[:2], choice.predictions[2]._replace(prior=None)))
     assert without.chosen == (2 if suffice else 1) and not without.levels_suffice
