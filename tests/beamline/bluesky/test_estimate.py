@@ -115,7 +115,7 @@ def test_a_plan_that_cannot_be_followed_has_a_fault(devices: tuple[Any, Any], mo
     plan = api.plan([reads(), endless(), plan_stubs.mv(rotation, 1000), plan_stubs.mv(rotation, 10)])
     said = [" ".join(map(str, scan.faults)) for scan in plan.scans]
     assert (
-        "cannot be predicted, because it raises an error if it gets no measured values (TypeError: 'NoneType' object"
+        "cannot be predicted, because the plan raises an error if it gets no measured values (TypeError: 'NoneType' object"
         in said[0]
     )
     assert said[1] == "the plan may never end: it sent 100 messages, the most that this estimate follows"

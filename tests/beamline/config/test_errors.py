@@ -24,11 +24,11 @@ FAULTS = {
     ),
     "decision without passes": (
         ("exposure_s: 0.01", "exposure_s: 0.01\n  decide: do\n  mode: step"),
-        "my.yaml:5: scan.decide do needs passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or",
+        "my.yaml:5: scan.decide do needs a scan in several passes; set scan.angles to {scheme: interlaced, passes",
     ),
     "decision of a single pass": (
         ("exposure_s: 0.01", "exposure_s: 0.01\n  decide: do\n  mode: step\n  pass_views: 12"),
-        "my.yaml:5: scan.decide do needs passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or",
+        "my.yaml:5: scan.decide do needs a scan in several passes; set scan.angles to {scheme: interlaced, passes",
     ),
     "unknown key": (
         ("exposure_s: 0.01", "exposure_s: 0.01\n  setle_s: 1"),

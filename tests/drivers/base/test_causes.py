@@ -14,7 +14,7 @@ from drivers.base.causes import of_bytes, of_library, of_port
 
 NOT_FOUND = "cannot open shared object file: No such file or directory"
 LOADERS = {
-    "{0}: wrong ELF class: ELFCLASS32": ("the library is for 32 bits", "for this Python"),
+    "{0}: wrong ELF class: ELFCLASS32": ("the library is built for 32-bit programs", "for this Python"),
     f"{{0}}: {NOT_FOUND}": ("for another processor", "for this processor"),
     f"libusb-1.0.so.0: {NOT_FOUND}": (
         "it needs libusb-1.0.so.0, which was not found",
