@@ -139,7 +139,7 @@ def test_an_interrupted_fit_goes_on_from_its_checkpoint(folder: Path, monkeypatc
     assert left(folder) == {"scan.h5", "whole.h5", "part.h5", "rest.h5", "fit.h5"}
     result = beamline("recon", "scan.h5", *options, "-o", "other.h5", "--resume", "fit.h5", "--rows", "0:1")
     assert result.exit_code == 5
-    assert "was written for another fit, so it cannot be resumed: projections" in result.stderr
+    assert "belongs to another fit, so it cannot be resumed: projections" in result.stderr
     assert "detector_shape" in result.stderr
     assert "other.h5" not in left(folder)
     fewer = [*options[2:], "--steps", "20", "-o", "other.h5", "--resume", "fit.h5"]

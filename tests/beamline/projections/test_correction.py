@@ -182,7 +182,7 @@ def test_views_of_several_exposures_have_the_light_of_one(flat: float) -> None:
     plan = plan_of(source, PLAIN)
     found = apply(plan, np.flatnonzero(source.table.kinds == 0), warn=pytest.fail).data
     np.testing.assert_allclose(found, SCAN.line_integrals(), atol=2e-3)
-    assert plan.done["flats"].sentence.startswith("Exposure times of the projections vary from 0.1")
+    assert plan.done["flats"].sentence.startswith("The exposure times of the projections vary from 0.1")
     assert not list(references_usable(ScanEvidence(source)))
 
 

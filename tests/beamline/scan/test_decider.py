@@ -134,7 +134,7 @@ def test_enough_is_chosen_with_its_reason_and_left_to_the_scan_to_do() -> None:
     scan = Scan()
     assert scan.after(3, law(36, exponent=0.5)) is Choice.ENOUGH
     assert not scan.stop.stopping
-    assert scan.chosen["reason"].startswith("the rest of the plan would add 0.62 dB")
+    assert scan.chosen["reason"].startswith("the remaining projections of the plan would improve the PSNR by 0.62 dB")
     assert scan.chosen["choice"] == "enough" and scan.recorded[0]["reason"] == scan.chosen["reason"]
 
 

@@ -319,7 +319,7 @@ def test_wide_views_that_are_missing_are_taken_also_where_no_references_follow(
                 [Choice.ENOUGH],
                 FIRST + 3,
                 0,
-                "with 3 of 12 projections; the scan itself had decided to omit the others.",
+                "with 3 of 12 projections; the scan itself had decided to omit the other projections.",
             ),  # in last flats
             ([Choice.AGAIN], FIRST + 9, 2, "with 10 of 12 projections."),  # another pass of three was to be taken
             (

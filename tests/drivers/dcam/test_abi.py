@@ -152,7 +152,7 @@ def test_a_library_that_lacks_another_names_it(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("at", "byte", "words"),
-    [(4, 1, "the library is for 32 bits"), (18, 0xF3, "the library was built for another processor")],
+    [(4, 1, "the library is built for 32-bit programs"), (18, 0xF3, "the library was built for another processor")],
 )
 def test_a_library_for_another_computer_is_named(
     fake_library: Path, tmp_path: Path, at: int, byte: int, words: str
