@@ -222,7 +222,7 @@ VIOLATIONS = {
     "no darks": ({"darks": FieldPlan(0, Place.BOTH, 0.05)}, "no darks: scan.darks.count is 0"),
     "passes": (
         {"mode": Mode.STEP, "pass_views": 3},
-        "scan.pass_views 3 divides 360 projections into more than 100 passes; set scan.pass_views to at least 4, or to 0",
+        "scan.pass_views 3 divides 360 projections into more than 100 passes; set scan.pass_views to at least 4",
     ),
 }
 
