@@ -295,7 +295,9 @@ def ordered_fista(
     descent, scale, count = _Descent(problem, x, subsets, prox, pull), problem.scale, len(subsets.views)
     n_views = problem.projector.geometry.n_views
     first = 0 if count == 1 else max(_LEAST_ON_SUBSETS, math.ceil(_VIEWS_ON_SUBSETS / n_views))
-    standstill = Standstill(problem.decide, still, voxel_device(problem.projector.device), first)
+    standstill = Standstill(
+        problem.decide, still, voxel_device(problem.projector.device), first, from_rest=not subsets.is_damped
+    )
     for k in range(sweeps):
         if k % RENEWED == 0:
             descent.renew_target()

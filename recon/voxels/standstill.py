@@ -32,10 +32,17 @@ class Standstill:
     Args:
         still: share of the norm of the volume; 0: all sweeps are made.
         first: number of sweeps after which the volume is compared for the first time with a later one.
+        from_rest: sweeps speed up, because momentum grows. The volume then also changes little in the first sweeps, so
+            the sweeps do not end while the changes grow. (Grains from 20 projections with two columns of weight 0: the
+            first sweeps on half voxels change the volume by 0.49 % and later ones by 0.77 %. The volume was 0.9 dB
+            worse if the sweeps ended after the first five.)
     """
 
-    def __init__(self, decide: Decisions, still: float, device: VoxelDevice[Any] = CPU, first: int = 0) -> None:
+    def __init__(
+        self, decide: Decisions, still: float, device: VoxelDevice[Any] = CPU, first: int = 0, from_rest: bool = False
+    ) -> None:
         self._decide, self._still, self._device, self._first = decide, still, device, first
+        self._from_rest = from_rest
         self._before: Any = None
         self._change, self._ended, self._done = math.inf, "bound", 0
 
@@ -46,8 +53,9 @@ class Standstill:
         self._done = done
         since = done - 1 - self._first
         if since >= 0 and since % MIRRORED == 0:
-            self._change = self._change_of(x)
-            if self._decide(_STILL, partial(operator.lt, self._change, self._still)):
+            before, self._change = self._change, self._change_of(x)
+            grows = self._from_rest and not self._change <= before < math.inf
+            if self._decide(_STILL, partial(operator.lt, math.inf if grows else self._change, self._still)):
                 self._ended = "still"
                 return True
         if not going:
