@@ -336,7 +336,7 @@ REMARKS = {
     ),
     "darks' exposure": (
         {"darks": FieldPlan(5, Place.END, 0.1)},
-        "darks are exposed for 0.1 s and projections for 0.05 s; hot pixels",
+        "darks are exposed for 0.1 s and projections for 0.05 s; these darks have other hot pixels",
     ),
     "blur": ({"exposure": 0.09, "angles": angles.fixed(360, 0, 2 * math.pi)}, "motion blur is 1.98 px"),
 }
