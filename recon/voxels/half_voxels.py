@@ -1,4 +1,5 @@
-"""Voxels half as wide as a pixel: the last iterations of total variation and of discrete tomography use them.
+"""Voxels half as wide as a pixel: the last iterations of total variation and of discrete tomography use them, and those
+of a state with a reference.
 
 A ray through voxels as wide as a pixel is interpolated between two of them. Therefore computed projections are more
 blurred than measured ones (`recon.voxels.resolution`), and one voxel must stand for the sharp edge of a grain. Voxels

@@ -20,7 +20,7 @@ ALL_LINES, CLEAR_LINES = 1.5, 3.0
 choose the weight.
 
 With `ALL_LINES`, trials choose a weight up to 1.8 times as large, because noise that looks like a line then has a small
-weight. Such volumes have cracks of 0.72 of their depth instead of 0.79.
+weight. Such volumes show cracks with 0.72 of their depth instead of 0.78 (30 projections of 160 columns, 10⁴ photons).
 """
 _SURE = 3.5  # standard deviations that the darkest voxel of a line must reach
 _STEP = 0.7  # standard deviations above the first ones that lower the weight by one more unit
