@@ -127,7 +127,7 @@ class ContinuedCount:
                 is_long = len(times) > 2 and time - times[-1] > 1.5 * float(np.median(np.diff(times)))
                 if last < top or raw > low + 1 or (raw != low and is_long):
                     left_out = "" if self._last_wrap > top - low else f", and {low} as if it had been skipped"
-                    note = f"Numbers went from {last} to {raw}: the count is continued beyond {top}{left_out}."
+                    note = f"Frame numbers went from {last} to {raw}: the count is continued beyond {top}{left_out}."
             elif self._last_wrap and top - _NEAR <= raw <= top and low <= last <= low + _NEAR:
                 self.raw = last  # exchanged with its neighbour
                 return raw + self._wrapped - self._last_wrap, note
@@ -445,24 +445,10 @@ class Sorter:
         self._now = next(i for i, each in self._taken.items() if each is views)
 
     def _unwrapped(self, raw: int, time: float = math.nan, *, is_anew: bool = False) -> int:
-        """The number, continued beyond the end of a counter of 16 or 32 bits. If more time has passed than between the
-        frames before, number 0 may be lost."""
-        last, self._raw = raw if self._raw is None else self._raw, raw
-        for low, top in _RANGES:
-            if top - _NEAR <= last <= top and low <= raw <= low + _NEAR and not is_anew:
-                self._last_wrap = top - low + (low != 0 or raw == 0)  # cameras of GigE Vision leave out 0
-                self._wrapped += self._last_wrap
-                times = [each.time for each in (*self._recent, *self.held)]
-                is_long = len(times) > 2 and time - times[-1] > 1.5 * float(np.median(np.diff(times)))
-                if last < top or raw > low + 1 or (raw != low and is_long):
-                    left_out = "" if self._last_wrap > top - low else f", and frame number {low} counts as skipped"
-                    self._note = (
-                        f"Frame numbers went from {last} to {raw}: the count is continued beyond {top}{left_out}."
-                    )
-            elif self._last_wrap and top - _NEAR <= raw <= top and low <= last <= low + _NEAR:
-                self._raw = last  # exchanged with its neighbour
-                return raw + self._wrapped - self._last_wrap
-        return raw + self._wrapped
+        times = [each.time for each in (*self._recent, *self.held)]
+        number, note = self._numbers.continued(raw, time, times, is_anew=is_anew)
+        self._note = note or self._note
+        return number
 
     def pass_over(self, raw: int) -> range:
         """Record that no frame of the present block up to this number will come any more. Returns the numbers that are
