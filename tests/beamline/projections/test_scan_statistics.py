@@ -78,7 +78,7 @@ def test_photons_and_dose_follow_from_the_flats(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("energy_kev", "material", "kinds", "said"),
     [
-        (None, "water", (0, 1, 2), "does not state its energy"),
+        (None, "water", (0, 1, 2), "does not state the energy"),
         (20.0, "Xx", (0, 1, 2), "not a known material"),
         (20.0, None, (0,), "no darks and flats"),
     ],

@@ -178,7 +178,7 @@ def test_references_in_folders_beside_the_views_are_taken_for_counts(tmp_path: P
     said = _of_references(SourceOptions(views, "counts", angles))
     assert said == "The darks and flats next to the projections are used: Dark_After, Flat_Before."
     _written(tmp_path / "Tomo_2", [f"IMAT_other_{i}.tif" for i in range(4)])  # whose flats are they?
-    assert "flats are missing. Give --flats FILE" in _of_references(SourceOptions(views, "counts", angles))
+    assert "flats are missing. Give --flats with a file" in _of_references(SourceOptions(views, "counts", angles))
 
 
 def test_a_defect_while_looking_beside_the_views_is_no_scan_without_references(
