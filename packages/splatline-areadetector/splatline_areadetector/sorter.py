@@ -126,7 +126,7 @@ class ContinuedCount:
                 self._wrapped += self._last_wrap
                 is_long = len(times) > 2 and time - times[-1] > 1.5 * float(np.median(np.diff(times)))
                 if last < top or raw > low + 1 or (raw != low and is_long):
-                    left_out = "" if self._last_wrap > top - low else f", and {low} as if it had been skipped"
+                    left_out = "" if self._last_wrap > top - low else f", and frame number {low} counts as skipped"
                     note = f"Frame numbers went from {last} to {raw}: the count is continued beyond {top}{left_out}."
             elif self._last_wrap and top - _NEAR <= raw <= top and low <= last <= low + _NEAR:
                 self.raw = last  # exchanged with its neighbour
