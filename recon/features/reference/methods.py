@@ -20,6 +20,7 @@ from recon.features.reference.fit import PLAN, StateFit
 from recon.features.reference.motion import KNOTS, Basis, padded
 from recon.features.reference.particles import bytes_placed, require_finite
 from recon.features.reference.preview import preview_of
+from recon.features.reference.weights import ALL_LINES, CLEAR_LINES
 from recon.voxels.choice import TrialChoice
 from recon.voxels.half_voxels import BY_QUALITY, COST, halved, uses_half_voxels
 from recon.voxels.iterative import solve_views, watched
@@ -205,7 +206,8 @@ class _State:
             start = np.where(moved.known(), start, x)
         fit = StateFit(problem, moved, start.astype(np.float32), weight, width)
         fit.rounds(_ROUNDS, _FIRST)
-        fit.sharpen(_SHARPER, most=_LAST)
+        # on whole voxels, faint lines cost 0.1 to 0.2 dB, and cracks become no deeper
+        fit.sharpen(_SHARPER, most=_LAST, lines_from=ALL_LINES if self._halves else CLEAR_LINES)
         if self._halves and (count := fit.on_half_voxels(most=_LAST)):
             problem.decide.settings["half_voxel_iterations"] = count
         problem.decide.ended = None  # it describes only the last of several rounds

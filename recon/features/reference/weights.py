@@ -16,8 +16,8 @@ from recon.voxels.voxel_problem import VoxelProblem
 
 _FLOOR = 0.1  # slope of the change, in particle levels per voxel, at which the weight is half
 ALL_LINES, CLEAR_LINES = 1.5, 3.0
-"""Standard deviations of the noise from which on a voxel of a dark line counts: for the volume, and for the trials that
-choose the weight.
+"""Standard deviations of the noise from which on a voxel of a dark line counts: for a volume that ends on half voxels,
+and for other volumes and the trials that choose the weight.
 
 With `ALL_LINES`, trials choose a weight up to 1.8 times as large, because noise that looks like a line then has a small
 weight. Such volumes show cracks with 0.72 of their depth instead of 0.78 (30 projections of 160 columns, 10⁴ photons).
