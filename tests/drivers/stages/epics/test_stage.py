@@ -84,7 +84,7 @@ def test_a_limit_switch_ends_the_move_with_its_name() -> None:
     stage = _stage(url, clock)
     stage.start_move(math.radians(20), SPEED)
     with pytest.raises(
-        DeviceError, match=r"stopped short of 20.*Move it away.*stands at 10.0000 deg.*upper limit switch"
+        DeviceError, match=r"stopped short of 20.*Move the stage off.*stands at 10.0000 deg.*upper limit switch"
     ):
         stage.wait(60)
 
