@@ -189,7 +189,7 @@ def test_a_host_program_is_not_started_again(host: str | None, tmp_path: Path, m
     assert lines == [f"{sys.prefix} True\n"]
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     monkeypatch.setattr(sys, "base_prefix", str(tmp_path))
-    with pytest.raises(NoPythonError, match="Set BEAMLINE_PYTHON") as refused:
+    with pytest.raises(NoPythonError, match="Set the environment variable BEAMLINE_PYTHON") as refused:
         python()
     assert repr(program) in user_message(refused.value) and exit_code(refused.value) == 2
     monkeypatch.setenv("BEAMLINE_PYTHON", "/opt/python")

@@ -153,7 +153,7 @@ def test_bytes_and_seconds_of_the_most_are_foreseen(share: float, most: int) -> 
     whole = work_out(plan, stage.limits, stage.to_counts, camera.timing)
     bare = work_out(replace(plan, retake_share=0.0), stage.limits, stage.to_counts, camera.timing)
     assert (whole.duration, whole.total_bytes) == (bare.duration, bare.total_bytes)
-    said = [remark for remark in whole.remarks if "taken again" in remark]
+    said = [remark for remark in whole.remarks if "projections again" in remark]
     if most == 0:
         assert (said, whole.retake_seconds) == ([], 0.0)
         return

@@ -80,13 +80,20 @@ NEXT, ENOUGH = option(Choice.NEXT, 1.0, off=0.2), PassOption(Choice.ENOUGH, 0, 0
     ("offered", "target", "spent", "rest", "chosen", "why"),
     [
         ([NEXT], QUALITY, NOTHING, 1.01, Choice.NEXT, "1.00 dB (0.80 to 1.20) in 10 s"),
-        ([NEXT], QUALITY, NOTHING, 1.0, Choice.ENOUGH, "would add 1.00 dB"),
+        ([NEXT], QUALITY, NOTHING, 1.0, Choice.ENOUGH, "would improve the PSNR by 1.00 dB"),
         ([NEXT], ScanTarget(), NOTHING, 0.1, Choice.NEXT, "1.00 dB"),
         ([NEXT], ScanTarget(seconds=100), (90.0, 0), 9, Choice.NEXT, "1.00 dB"),
         ([NEXT], ScanTarget(seconds=100), (91.0, 0), 9, Choice.ENOUGH, "after 101 s; the target allows 100 s"),
         ([NEXT], ScanTarget(dose=0.5), (0, 0.4), 9, Choice.NEXT, "1.00 dB"),
         ([NEXT], ScanTarget(dose=0.5), (0, 0.41), 9, Choice.ENOUGH, "51 % of the plan's dose; the target allows 50 %"),
-        ([NEXT], ScanTarget(5.0, 100, 1), NOTHING, 2, Choice.ENOUGH, "is accepted"),  # whichever is met first
+        (
+            [NEXT],
+            ScanTarget(5.0, 100, 1),
+            NOTHING,
+            2,
+            Choice.ENOUGH,
+            "the target accepts a loss of 5 dB",
+        ),  # whichever is met first
         (
             [NEXT, option(Choice.AGAIN, 1.1)],
             QUALITY,

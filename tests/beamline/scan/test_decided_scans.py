@@ -89,7 +89,7 @@ def test_a_scan_ends_when_its_views_are_enough_and_says_why(tmp_path: Path) -> N
     assert ran.of("frame")[-1].data["n"] == ran.of("frame")[-1].data["of"] == 16
     run, said = (
         describe(ran.folder),
-        "The scan ended after pass 3, because `enough` was chosen by the program: the rest of the plan ",
+        "The scan ended after pass 3, because `enough` was chosen by the program: the remaining projections of ",
     )
     assert (run.frames, run.planned, run.state) == (16, 19, "done") and run.ended.startswith(said)
     assert "16 of 19" in cells(run)
@@ -97,7 +97,7 @@ def test_a_scan_ends_when_its_views_are_enough_and_says_why(tmp_path: Path) -> N
         assert [(found.severity, found.message) for found in scan_ended(ScanEvidence(source))] == [("info", run.ended)]
         facts = facts_of(source)
         assert facts.frames == "16/19" and run.ended in facts.remarks and source.attributes["ended"] == run.ended
-    assert run.ended.endswith("a loss of 1 dB is accepted. 3 planned frames were not taken.")
+    assert run.ended.endswith("the target accepts a loss of 1 dB. 3 planned frames were not taken.")
     assert len(ran.of("recon_done")) == 1  # its volume is waited for
 
 

@@ -44,8 +44,8 @@ def test_its_need_of_memory_and_the_reason_are_stated() -> None:
 @pytest.mark.parametrize(
     ("changes", "proposed"),
     [
-        ((), "{scheme: interlaced, passes: 6} it has 22.0"),
-        (("scan.mode=step", "scan.period_s=1"), "{scheme: golden} it has 22.9"),
+        ((), "{scheme: interlaced, passes: 6} the PSNR was 22.0"),
+        (("scan.mode=step", "scan.period_s=1"), "{scheme: golden} the PSNR was 22.9"),
         (("scan.angles.views=181",), None),  # of no number of equal passes
         (("scan.angles={scheme: interlaced, views: 180, passes: 6}",), None),
         (("scan.angles.views=24",), None),  # over before anybody looks

@@ -71,7 +71,9 @@ def test_flats_without_the_light_of_the_views_are_told(tmp_path: Path, monkeypat
     instrument = FakeInstrument(at={5: lambda: monkeypatch.setitem(fakes.LEVEL, True, 20000)})  # the first view
     ran = Ran(tmp_path, instrument, "scan.flats.at=start")
     (fault,) = ran.result.reference_faults
-    assert fault.startswith("The flats 3-4: they have 9.09% of the intensity of the projections (limit 50%)")
+    assert fault.startswith(
+        "The flats 3-4: these flats have only 9.09% of the intensity of the projections (limit 50%)"
+    )
     assert [finding.severity for finding in validate(ran.result.path) if fault in finding.message] == ["error"]
 
 

@@ -96,7 +96,7 @@ def test_a_width_is_the_mean_over_pixels_and_angles(beam: Geometry, random_gauss
 
 
 def test_a_width_and_the_uncorrected_factor_are_refused(random_gaussians: Make) -> None:
-    with pytest.raises(ValueError, match="corrected factor"):
+    with pytest.raises(ValueError, match="corrected footprints"):
         project(random_gaussians(), STRAIGHT.seen_with(RayWidth(pixel=1)), model=RayModel(rectified=False))
 
 
