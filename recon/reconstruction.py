@@ -53,7 +53,7 @@ def reconstruct(
     """Reconstruct a volume from line integrals.
 
     Values that are masked or not finite are filled from their neighbours and get weight 0. If photons are few, give the
-    measured `Counts` instead of line integrals. From `Counts`, the method gets line integrals with weights that
+    measured `Counts` instead of line integrals. `Counts` are converted to line integrals with weights that
     represent the likelihood of the counts (`recon.prep.counts.line_integrals`). The weights from the counts are
     multiplied by `use.weights`. `Views` contain their geometry, their weights and the reach of the sample, so
     `reconstruct` does not measure the reach again.

@@ -103,8 +103,8 @@ scan_options = together(
         help=(
             "State which frames are darks and flats, for example darks=0:5,flats=5:10+95:100. All other frames are "
             "projections. This option overrides the file. none=30:38+61:62 leaves these frames out. If you give "
-            "only none=, the file states the kind of the other frames. 0::2 or 1::2: use every second projection "
-            "with its darks and flats, if two exposures or thresholds alternate."
+            "only none=, the file states the kind of the other frames. If two exposures or thresholds alternate, "
+            "--frames 0::2 or --frames 1::2 uses every second projection, dark and flat."
         ),
     ),
     option(

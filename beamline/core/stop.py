@@ -201,8 +201,8 @@ class StopRequest:
     undone.
 
     Any thread or signal handler can make the request. The class uses no lock, because a signal handler that interrupts
-    another handler would wait for ever for a lock that the interrupted handler holds. Instead, a single assignment sets
-    each of the attributes below.
+    another handler would wait for ever for a lock that the interrupted handler holds. Instead of using a lock, each
+    method sets an attribute by a single assignment.
 
     Args:
         now: a clock that gives real time in s.

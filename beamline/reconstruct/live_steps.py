@@ -224,8 +224,8 @@ def corrected_again(
         why = _SHADED
     if gone:
         why = (
-            f"The fit drops {count(gone, 'projection')} and continues, because the monitor has flagged these "
-            "projections meanwhile, or the scan has taken them again"
+            f"The fit continues without {count(gone, 'projection')} that the monitor has flagged meanwhile, or that "
+            "the scan has taken again"
         )
     live.enter("correcting", why)
     state.batches.clear()  # free the memory of the old line integrals first

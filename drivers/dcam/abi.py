@@ -76,7 +76,7 @@ _ADVICE: Mapping[int, str] = MappingProxyType(
         Error.FAILOPENCAMERA: "Close other programs that use the camera, then switch it off and on",
         Error.NOCONNECTION: "Check the camera's power and cable, then connect again",
         Error.NOMEMORY: "Give the camera's ring buffer fewer bytes, or free memory",
-        Error.BUSY: "End other sessions with the camera in this process, or the running capture",
+        Error.BUSY: "End the running capture, or other sessions with the camera in this process",
         Error.FAILOPEN: "Close other programs that use the camera, then switch it off and on",
         Error.TOOFREQUENTTRIGGER: "Turn the stage more slowly or use a shorter exposure: triggers arrive too fast",
         Error.NOTRIGGER: "Check the trigger cable and its polarity",

@@ -119,7 +119,9 @@ class Travel:
         """The error for a train that the stage cannot emit; the message states the conditions for trains."""
         unit, least = self.limits.interval_unit, least_interval(self.limits)
         multiple = (
-            f" apart by a multiple of {unit} counts (if the output toggles: by an even multiple)," if unit > 1 else ""
+            f" apart by a multiple of {unit} counts (a toggled output needs an even number of counts),"
+            if unit > 1
+            else ""
         )
         return DeviceRefused(
             self.name,

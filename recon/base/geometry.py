@@ -294,7 +294,7 @@ class Geometry:
 
     @property
     def reach(self) -> float:
-        """Distance in mm, at the rotation axis, from the axis to the farthest detector edge of any projection.
+        """Radius of the field of view in mm: distance from the rotation axis to the farthest ray of any projection.
 
         The roll of the detector and laterally offset projections are ignored. For a wide cone, the distance is limited
         to 0.7 of the distance from the source to the rotation axis.

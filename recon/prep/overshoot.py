@@ -77,9 +77,9 @@ class Overshoot:
 
     def in_words(self) -> str:
         return (
-            "Expect phase fringes, or images that were sharpened: next to the outer edges of the sample, line "
-            f"integrals lie below the air by {self.share:.1%} of the step at the edge. Blur and noise do not cause "
-            "this."
+            "The projections have phase fringes, or they were sharpened: next to the outer edges of the sample, line "
+            f"integrals are below those of air, by {self.share:.1%} of the step at the edge. Blur and noise do not "
+            "make line integrals fall below those of air."
         )
 
 

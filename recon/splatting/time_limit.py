@@ -183,10 +183,11 @@ class FinalFit(Iterative):
         # The time limit may also cut PnP-DCT steps, which the number of iterations does not show.
         finished = plan.sweeps == self.method.finish and (sweeps == plan.sweeps or control.now() < end)
         if not ((finished and reached.step >= reached.steps) or stop.stopped):
+            refinement = "complete" if finished else "shorter" if sweeps else "left out"
             warnings.warn(
                 "to get the full quality, reconstruct the finished scan: "
-                f"{self.seconds:g} s were not enough for the final fit. It made {reached.step} of {reached.steps} "
-                f"steps, and {'a whole' if finished else 'a shorter' if sweeps else 'no'} voxel refinement",
+                f"{self.seconds:g} s were not enough for the final fit. The fit made {reached.step} of "
+                f"{reached.steps} steps, and the voxel refinement was {refinement}",
                 stacklevel=2,
             )
         settings = {

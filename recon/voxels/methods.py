@@ -90,8 +90,8 @@ class FistaTv(HalfVoxels):
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The residuals in the held-out projections, with the weight `tv_weight`, or with the best weight if
-        `tv_weight` is None. The test volume has voxels as wide as a pixel, not half as wide, because the trial computes
-        the held-out projections from voxels as wide as a pixel.
+        `tv_weight` is None. Test volumes do not use half voxels, because the trial computes the held-out projections
+        from voxels as wide as a pixel.
         """
         if self.tv_weight is not None or trial.weight is None:
             return trial.predicted(with_halves(self, False))

@@ -136,9 +136,9 @@ class ZaberSettings(Wiring, StageFigures):
         if speed < 1 or steepest < 1:
             least = math.degrees(1e4 / per_radian)
             raise ValueError(
-                f"{math.degrees(self.max_speed):g} deg/s and {math.degrees(self.acceleration):g} deg/s² are the "
-                f"native values {speed} and {steepest}, but both must be 1 or more. The smallest acceleration is "
-                f"{least:g} deg/s²"
+                f"{math.degrees(self.max_speed):g} deg/s and {math.degrees(self.acceleration):g} deg/s² "
+                f"become {speed} and {steepest} in the controller's units, but each must be 1 or more. The smallest "
+                f"acceleration is {least:g} deg/s²"
             )
         return speed, steepest
 

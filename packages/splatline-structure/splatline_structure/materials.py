@@ -93,9 +93,9 @@ def materials_of(volume: F32, count: int, seed: int = 0) -> Materials:
         worst = int(valleys.argmax())
         raise ValueError(
             f"materials {worst + 1} and {worst + 2} of {count} have no contrast: their grey levels are "
-            f"{levels[worst]:.4g} and {levels[worst + 1]:.4g}, but {valleys[worst]:.2g} times as many voxels have "
-            "values half-way between the two grey levels as values near the rarer grey level (at most "
-            f"{MOST_BETWEEN:g} times is allowed)"
+            f"{levels[worst]:.4g} and {levels[worst + 1]:.4g}. The number of voxels half-way between the two grey "
+            f"levels is {valleys[worst]:.2g} times the number of voxels near the rarer grey level; expected at most "
+            f"{MOST_BETWEEN:g} times"
         )
     return Materials(levels, spread, spread * np.array([math.sqrt(8 / core.size) for core in cores]))
 

@@ -88,7 +88,7 @@ def test_a_view_that_was_taken_again_leaves_the_volume(tmp_path: Path) -> None:
     record = read_reconstruction(tmp_path / "recon.h5")
     assert set(np.ravel(record.parameters["view_frames"])) == set(range(4, 35)) - {12}
     assert psnr(SCAN.truth(record.volume.grid), record.volume.data) > 20 and metrics["residual"] < 0.1
-    said = "The fit drops 1 projection and continues, because the monitor has flagged them meanwhile"
+    said = "The fit continues without 1 projection that the monitor has flagged meanwhile"
     anew = [event for event in events if said in str(event.data.get("message"))]
     assert len(anew) == 1
 

@@ -236,7 +236,7 @@ class TestFeeds:
         usable: UsableViews = scan.views.usable().only(np.delete(ROWS, [3, 8]))
         after = corrected_again(scan, state, usable, "no reason")
         assert (after.n_views, after.fit.n_views) == (28, 28)
-        assert "drops 2 projections and continues" in events[-1].data["message"]
+        assert "continues without 2 projections" in events[-1].data["message"]
         np.testing.assert_array_equal(joined(after).view_ids, np.delete(ROWS, [3, 8]))
 
     def test_a_fit_that_is_slower_than_the_scan_is_reported_once(self, live: Callable[..., Any]) -> None:

@@ -109,7 +109,7 @@ def test_volume_file_checkpoint_and_their_events(tmp_path: Path) -> None:
     )
     fitted, centres = read_reconstruction(tmp_path / "r2.h5"), np.ones((SCAN.angles.size, 3))
     rest = {"view_centres_mm": centres, "roi": "0:4,0:4,0:4", "roi_found": "4 of 8 slices", "frames_per_view": 2}
-    rest |= dict.fromkeys(("frames_unmeasured_in_part", "rows_unmeasured"), np.arange(2))
+    rest |= dict.fromkeys(("frames_unmeasured_in_part", "rows_unmeasured", "slices_by_another_method"), np.arange(2))
     parameters: dict[str, Any] = {**fitted.parameters, **rest}
     model = {**fitted.model, "view_centres": centres}
     write_reconstruction(tmp_path / "free.h5", replace(fitted, parameters=parameters, model=model))

@@ -121,7 +121,7 @@ def test_a_method_streams_with_its_own_settings(data: np.ndarray, phantom: Phant
     found = model.gaussians
     assert found is not None and found.kernel is Kernel.GAUSSIAN
     assert psnr(phantom.attenuation(GRID), model.snapshot().data) > 20
-    with pytest.raises(ValueError, match="leave it out"):
+    with pytest.raises(ValueError, match="leave joined_pixels out"):
         recon.R2(fit=FitSettings(joined_pixels=2)).stream(VIEWS, 0, SteppedClock(tick=0.01))
 
 
