@@ -71,7 +71,7 @@ def test_a_real_stages_turn_is_checked() -> None:
         ({"axis": 0}, "axis is 0"),
         ({"output": 0}, "output is 0"),
         ({"toggle": True, "pulse_width": 1e-3}, "choose a width or toggle"),
-        ({"acceleration": 1e-6}, "native values .* and 0"),
+        ({"acceleration": 1e-6}, "become .* and 0 in the controller"),
         ({"max_speed": 0.0}, "max_speed is 0.0"),
     ],
 )
