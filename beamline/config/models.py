@@ -396,8 +396,8 @@ class Config(Section):
             raise ValueError("scan.energies and scan.states exclude each other; give only one of the two keys")
         if self.scan.state is not None and self.scan.state > (self.scan.states.count if self.scan.states else 0):
             raise ValueError(
-                f"scan.state {self.scan.state} is larger than the number of states in scan.states; leave out "
-                "scan.state, because the program sets this number in a series of states"
+                f"scan.state {self.scan.state} is larger than the number of states in scan.states, or there is no "
+                "scan.states; leave out scan.state, because the program sets this number in a series of states"
             )
         if self.scan.states is not None and self.scan.states.references == "first" and self.scan.darks.at is Place.END:
             raise ValueError(

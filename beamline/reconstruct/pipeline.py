@@ -188,7 +188,9 @@ def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_st
             return True
         if should_stop() and not follower.source.finished:
             if not follower.has_volume:
-                raise KeyboardInterrupt("stopped before there were projections for a volume; nothing was written")
+                raise KeyboardInterrupt(
+                    "stopped before there were enough projections for a volume; nothing was written"
+                )
             return False
         if why := writer.lost(clock.now(), grew, lambda: follower.source.finished):
             raise DataError(

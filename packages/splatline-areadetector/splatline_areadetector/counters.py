@@ -90,7 +90,7 @@ class Counters:
                 f"lost by the plugin {self.plugin.prefix}, whose queue was full (DroppedArrays rose by {dropped:.0f})"
             )
         if counted is None:
-            return "lost before this program received frames (no counter of the IOC shows where)"
+            return "lost before this program received these frames (no counter of the IOC shows where)"
         if counted > len(gap.ids):
             return (
                 "lost between the plugin and this program: in the network, or in the server's queue for this "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -37,19 +38,19 @@ class Losses:
         """Record a frame that could not be assigned. True if it is the first one with this reason."""
         return _is_first(self._unplaced, why, unique_id)
 
-    def sentences(self, status: str, counters: Counters, n_repeats: int) -> list[str]:
+    def sentences(self, status: Callable[[], str], counters: Counters, n_repeats: int) -> list[str]:
         """A sentence for each cause of the loss.
 
         Args:
-            status: what the other program says it is doing now; may be empty.
+            status: function that returns what the other program says it is doing now; may be empty.
             n_repeats: number of frames that arrived twice.
         """
         words = [
             f"{count(len(ids), 'frame')} arrived ({spans(ids)}) but could not be used: {why}."
             for why, ids in self._unused.items()
         ]
-        if self._unused and status:
-            words.append(f"Now: {status}.")
+        if self._unused and (now := status()):
+            words.append(f"Now: {now}.")
         words += loss_sentences(self.gaps, self.overflowed, counters)
         if n_repeats:
             words.append(

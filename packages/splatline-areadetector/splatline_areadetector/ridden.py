@@ -310,7 +310,7 @@ class RiddenFrames:
         words = missing_sentences(self._plan, self._sorter)
         if self._views:
             words.append(first_or_last_sentence(self._plan, self._sorter, ended=ended))
-        words += self._losses.sentences(self._guide.status, self._ride.counters, self._sorter.repeats)
+        words += self._losses.sentences(lambda: self._guide.status, self._ride.counters, self._sorter.repeats)
         return "".join(f" {sentence}" for sentence in words if sentence)
 
     def _raise_outcome(self) -> None:

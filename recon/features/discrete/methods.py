@@ -47,7 +47,7 @@ _REJECTED = len(COUNTS) + 4
 _NO_LEVELS = (
     "this is the volume of fista-tv, because no discrete levels were found that predict held-out projections better"
 )
-_REJECTED_IN_TRIAL = "its levels were rejected, because they do not predict the held-out projections better"
+_REJECTED_IN_TRIAL = "no levels were found that pass all tests with held-out projections"
 
 
 @dataclass(frozen=True)

@@ -171,7 +171,7 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
             False,
             (
                 f"a copy of the reference that is displaced by a voxel {where} predicts held-out projections "
-                "equally well"
+                "equally well or better"
             ),
         )
     all_views = best.strength * np.sqrt(ONE_IN / (ONE_IN - 1))

@@ -153,8 +153,8 @@ class FromReference(Method):
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
         """The same as for `otherwise`; half voxels always with "best", and never with "preview"."""
-        otherwise = self.otherwise.with_quality(quality, default_count)
-        return replace(self, otherwise=otherwise, half_voxels=BY_QUALITY[quality])
+        otherwise, wanted = self.otherwise.with_quality(quality, default_count), BY_QUALITY[quality]
+        return replace(self, otherwise=otherwise, half_voxels=self.half_voxels if wanted is None else wanted)
 
     def toy(self) -> Self:
         return replace(self, otherwise=self.otherwise.toy())

@@ -141,6 +141,16 @@ def test_levels_that_passed_their_tests_are_taken_even_if_they_gain_little(
     assert without.chosen == (2 if suffice else 1) and not without.levels_suffice
 
 
+def test_levels_do_not_take_the_place_of_a_candidate_that_predicts_better() -> None:
+    levels = Prior(1.0, materials=MaterialPrior((0.0, 1.0), (0.5, 0.5), 1.0, 0.02, 0.1))
+    means = {"fbp": 0.9, "fista-tv": 1.2, "discrete": 1.1, "r2": 1.0}
+    choice = TrialChoice("16 rows")
+    for name, mean in means.items():
+        prior = levels if name == "discrete" else None
+        choice = choice.after(Prediction(name, (mean + SCATTER).tolist(), prior))
+    assert choice.chosen == choice.best == 0
+
+
 def test_a_choice_is_the_same_from_a_file() -> None:
     """Other slabs of a volume follow that of the first one."""
     choice = TrialChoice("16 rows", 0.02)

@@ -103,7 +103,7 @@ def test_auto_lists_no_residual_of_rejected_levels() -> None:
     ))  # fmt: skip
     assert beside.method == "fista-tv" and "discrete 0." not in beside.settings["chosen_because"]
     assert beside.settings["chosen_because"].endswith(
-        "; discrete: its levels were rejected, because they do not predict the held-out projections better"
+        "; discrete: no levels were found that pass all tests with held-out projections"
     )
     assert alone.method == "discrete" and "; discrete 0." in alone.settings["chosen_because"]
 
