@@ -66,7 +66,7 @@ def test_settings_that_a_device_would_refuse() -> None:
         ("devices.stage.max_speed_deg_s=5001", r"devices.stage: 5001 deg/s are 5001000 pulses/s, .* 1 to 5000000"),
         ("devices.stage.max_speed_deg_s=0.0001", "devices.stage: 0.0001 deg/s are 0 pulses/s"),
         ("devices.stage.pulse_width_s=0.005", "devices.stage: the trigger output has no pulses of 0.005 s; legal:"),
-        (f"devices.stage={STAGES['zaber'].replace('60,', '1e-9,')}", "devices.stage: 30 deg/s and 1e-09 deg/s² are"),
+        (f"devices.stage={STAGES['zaber'].replace('60,', '1e-9,')}", "devices.stage: 30 deg/s and 1e-09 deg/s² become"),
         (f"devices.stage={STAGES['pi_gcs'].replace('60,', '1e-9,')}", "devices.stage: .* must be "),
     ):
         with pytest.raises(ConfigError, match=message):
