@@ -215,7 +215,7 @@ def _command(name: str) -> CommandEntry | None:
     return own_commands().get(name) or commands().get(name)
 
 
-_GONE = {"segment": " , which was removed: use `beamline structure VOLUME` instead (pip install splatline-structure)"}
+_GONE = {"segment": ", which was removed: use `beamline structure VOLUME` instead (pip install splatline-structure)"}
 
 
 class LazyGroup(click.Group):

@@ -110,7 +110,7 @@ def ridden(loopback: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -
     )  # fmt: skip
     with ExitStack() as stack:
         server = stack.enter_context(_program(*publish, log=log / "publish.log"))
-        _line(server, "Publishing T:DET:Pva1:Image at 127.0.0.1")
+        _line(server, "Publishing the image T:DET:Pva1:Image at 127.0.0.1")
         viewers = [stack.enter_context(_program(HERE / "viewer.py", "T:DET:Pva1:Image", log=log / f"viewer{i}.log"))
                    for i in range(2)]  # fmt: skip
         client = stack.enter_context(Context("pva", nt=False))
