@@ -26,7 +26,7 @@ from recon.base.choices import Quality
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.iterative import VoxelMethod
-from recon.voxels.ordered_fista import Pull, Subsets, ordered_fista, subsets_of
+from recon.voxels.ordered_fista import Prox, Pull, Subsets, ordered_fista, subsets_of
 from recon.voxels.priors import TvWeight, tv_prox
 from recon.voxels.resolution import smoothed
 from recon.voxels.standstill import USUAL_SWEEPS, with_quality
@@ -102,29 +102,24 @@ class HalfVoxels(VoxelMethod):
         """The volume x [y, x, z] after further iterations on half voxels; x itself if `halves` says that there are
         none.
 
-        Total variation is a surface times a change of density. Differences between voxels half as wide, summed over
-        four times as many voxels, are twice as large. Therefore the weight is halved.
-
         Args:
             x: the volume of whole voxels.
             mu: weight μ of total variation with whole voxels.
             tv_steps: dual steps of each proximal step with whole voxels.
-            pull: function of the problem with half voxels and of its first volume; returns the pull of each step.
+            pull: as in `on_half_voxels`.
             first: number of planned iterations before those that made x, for the progress.
         """
         projector, decide = problem.projector, problem.decide
         if not self.halves(projector.geometry, projector.grid):
             return x
         before = 0 if decide.ended is None else decide.ended.after
-        fine, start = with_half_voxels(problem, first + before), repeated(x)
-        on_halves = ordered_fista(
-            fine, start, TvWeight(mu / 2), subsets_on_halves(fine), sweeps=self.iterations,
-            prox=tv_prox(fine, DUAL_STEPS * tv_steps), pull=None if pull is None else pull(fine, start),
-            still=self.still,
+        x = on_half_voxels(
+            problem, x, mu, lambda fine: tv_prox(fine, DUAL_STEPS * tv_steps), done=first + before,
+            sweeps=self.iterations, still=self.still, pull=pull,
         )  # fmt: skip
         if (ended := decide.ended) is not None:
             decide.ended = ended._replace(after=before + ended.after, on_half_voxels=ended.after)
-        return means_of_four(on_halves)
+        return x
 
 
 def with_halves(method: MethodT, wanted: bool) -> MethodT:
@@ -158,7 +153,32 @@ def uses_half_voxels(wanted: bool | None, geometry: Geometry, grid: Grid) -> boo
     return wanted is True or (few and abs(width - 1) < _AS_WIDE and not geometry.is_cone)
 
 
-def subsets_on_halves(problem: VoxelProblem) -> Subsets:
+def on_half_voxels(
+    problem: VoxelProblem, x: F32, mu: float, prox_of: Callable[[VoxelProblem], Prox], *, done: int, sweeps: int,
+    still: float, pull: MakePull | None = None,
+) -> F32:  # fmt: skip
+    """The volume x [y, x, z] of whole voxels after further iterations of `ordered_fista` on half voxels.
+
+    Total variation is a surface times a change of density. Differences between voxels half as wide, summed over four
+    times as many voxels, are twice as large. Therefore the weight is halved.
+
+    Args:
+        mu: weight μ of total variation with whole voxels.
+        prox_of: function of the problem with half voxels; returns the proximal step.
+        done: number of iterations on whole voxels, for the progress.
+        sweeps, still: as in `ordered_fista`.
+        pull: function of the problem with half voxels and of its first volume; returns the pull of each step.
+    """
+    fine, start = _with_half_voxels(problem, done), repeated(x)
+    on_halves = ordered_fista(
+        fine, start, TvWeight(mu / 2), _subsets(fine), sweeps=sweeps, prox=prox_of(fine),
+        pull=None if pull is None else pull(fine, start), still=still,
+    )  # fmt: skip
+    ny, nx, nz = x.shape
+    return on_halves.reshape(ny, 2, nx, 2, nz).mean(axis=(1, 3), dtype=np.float32)
+
+
+def _subsets(problem: VoxelProblem) -> Subsets:
     """All projections in each step if steps are damped; otherwise subsets, because steps are then short."""
     together = Subsets.of(problem, 1)
     return together if together.is_damped else Subsets.of(problem, subsets_of(problem.projector.geometry))
@@ -175,13 +195,7 @@ def repeated(x: F32) -> F32:
     return np.repeat(np.repeat(x, 2, axis=0), 2, axis=1)
 
 
-def means_of_four(x: F32) -> F32:
-    """The volume x [y, x, z] of half voxels on whole voxels: the mean of the four in each voxel."""
-    ny, nx, nz = x.shape
-    return x.reshape(ny // 2, 2, nx // 2, 2, nz).mean(axis=(1, 3), dtype=np.float32)
-
-
-def with_half_voxels(problem: VoxelProblem, done: int) -> VoxelProblem:
+def _with_half_voxels(problem: VoxelProblem, done: int) -> VoxelProblem:
     """The problem with half voxels, whose iterations follow `done` iterations on whole ones."""
     projector = replace(problem.projector, grid=halved(problem.projector.grid))
     data = smoothed(problem.views, projector.resolution, None if problem.weight is None else problem.weight > 0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import operator
 from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
@@ -54,8 +53,8 @@ class Standstill:
         since = done - 1 - self._first
         if since >= 0 and since % MIRRORED == 0:
             before, self._change = self._change, self._change_of(x)
-            grows = self._from_rest and not self._change <= before < math.inf
-            if self._decide(_STILL, partial(operator.lt, math.inf if grows else self._change, self._still)):
+            still = self._change < self._still and (not self._from_rest or self._change <= before < math.inf)
+            if self._decide(_STILL, partial(bool, still)):
                 self._ended = "still"
                 return True
         if not going:

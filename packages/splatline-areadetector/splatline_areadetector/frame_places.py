@@ -1,8 +1,9 @@
-"""What the sorter is told of a frame, and what it decides: its place in the plan, outside of it, or not known."""
+"""The known facts about a frame, its number, and the decision on its place in the plan."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Protocol
@@ -12,6 +13,8 @@ import numpy as np
 from drivers.base.frame import FrameKind
 
 VIEW = FrameKind.PROJECTION
+_NEAR = 100  # largest distance from the end of its range at which a counter may restart
+_RANGES = ((0, 2**16 - 1), (0, 2**31 - 1), (-(2**31), 2**31 - 1))
 
 
 @dataclass(frozen=True)
@@ -19,8 +22,8 @@ class BlockKey:
     """The phase of the scan in which a frame is taken.
 
     Attributes:
-        serial: number that differs between two blocks of darks or flats, even if they have the same kind. kind: kind of
-            the frame; None: the frame does not belong to a scan.
+        serial: number that differs between two blocks of darks or flats, even if they have the same kind.
+        kind: kind of the frame; None: the frame does not belong to a scan.
     """
 
     serial: int
@@ -139,3 +142,39 @@ class NewEpoch:
 
 
 Decision = FramePosition | Outside | Unknown | NewEpoch
+
+
+@dataclass
+class ContinuedCount:
+    """Continues the numbers of frames beyond the end of a counter of 16 or 32 bits.
+
+    Attributes:
+        raw: the last number as it was received.
+    """
+
+    raw: int | None
+    # how far the counter went back at the end of its range: at the last time, and in total
+    _last_wrap: int = 0
+    _wrapped: int = 0
+
+    def continued(self, raw: int, time: float, times: Sequence[float], *, is_anew: bool) -> tuple[int, str]:
+        """The number of the next frame, continued, and a message if numbers were left out, otherwise "". If more time
+        has passed than between the frames before, number 0 may be lost.
+
+        Args:
+            time, times: IOC's time of this frame, and of the frames before.
+            is_anew: the counter may have restarted for another reason.
+        """
+        last, self.raw, note = raw if self.raw is None else self.raw, raw, ""
+        for low, top in _RANGES:
+            if top - _NEAR <= last <= top and low <= raw <= low + _NEAR and not is_anew:
+                self._last_wrap = top - low + (low != 0 or raw == 0)  # cameras of GigE Vision leave out 0
+                self._wrapped += self._last_wrap
+                is_long = len(times) > 2 and time - times[-1] > 1.5 * float(np.median(np.diff(times)))
+                if last < top or raw > low + 1 or (raw != low and is_long):
+                    left_out = "" if self._last_wrap > top - low else f", and frame number {low} counts as skipped"
+                    note = f"Frame numbers went from {last} to {raw}: the count is continued beyond {top}{left_out}."
+            elif self._last_wrap and top - _NEAR <= raw <= top and low <= last <= low + _NEAR:
+                self.raw = last  # exchanged with its neighbour
+                return raw + self._wrapped - self._last_wrap, note
+        return raw + self._wrapped, note

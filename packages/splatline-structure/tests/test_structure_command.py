@@ -158,7 +158,7 @@ def test_without_contrast_in_the_middle_these_slices_are_named(here: Path) -> No
     np.save(here / "can.npy", volume)
     common = ("structure", "can.npy", *VOXEL_UM, "--quick", "--crop", "none", "--memory", "16M")
     result = beamline(*common)
-    words = "is allowed); only slices 14:26 fit into the memory and were measured: give more --memory, or"
+    words = "expected at most 1.5 times; only slices 14:26 fit into the memory and were measured: give more --memory, or"
     assert result.exit_code == 5 and words in result.stderr
     assert "views" not in result.stderr and "--materials" not in result.stderr
     assert "--slices, or give fewer --materials. Nothing" in beamline(*common, "--materials", "3").stderr
@@ -256,7 +256,7 @@ REFUSED = [
     (
         ("noise.npy", *VOXEL_UM),
         5,
-        "near the rarer grey level (at most 1.5 times is allowed); reconstruct from more projections. Nothing",
+        "near the rarer grey level; expected at most 1.5 times; reconstruct from more projections. Nothing",
     ),
     (("can.npy",), 5, "does not state the voxel size. Nothing was written"),
     (("can.npy", "--voxel-um", "nan"), 2, "expected the edge of a voxel in µm"),

@@ -27,10 +27,11 @@ from recon.voxels.voxel_problem import VoxelProblem
 PULL, WEAK_PULL = 0.02, 0.005
 """Factor c of the pull, and a weaker one.
 
-If the weaker one predicts held-out projections better, the densities of a material vary, and there are no discrete
-levels. (Bone from 50 projections and a walnut in a cone from 40: pulled weakly, the residual in held-out projections is
-11 and 5 % smaller than with total variation, but the volume is 1.2 and 1.0 dB worse, at best 0.1 dB better with another
-weight. PnP-DCT gains 1.7 dB there.) Levels that the user gives are pulled to weakly if no projections can be held out.
+If the weaker one predicts held-out projections better, the densities of a material may vary. The levels are then used
+only if the volume as it will be made predicts better than total variation. (Bone from 50 projections and a walnut in a
+cone from 40: pulled weakly, the residual in held-out projections is 11 and 5 % smaller than with total variation, but
+the volume is 1.2 and 1.0 dB worse, at best 0.1 dB better with another weight. PnP-DCT gains 1.7 dB there.) Levels that
+the user gives are pulled to weakly if no projections can be held out.
 """
 COUNTS = (2, 3)
 """Numbers of levels that are tried (air may be one of them); four are tried if three are best."""

@@ -58,11 +58,10 @@ class Discrete(HalfVoxels):
     `recon.features.discrete.mixture`. Memory: 10 volumes and 2 times the projections.
 
     Held-out projections choose the number of levels, their values, and the factor on the FISTA-TV weight μ. The result
-    is the FISTA-TV volume if discrete levels do not predict the held-out projections significantly better, or if a
-    weaker pull to the levels predicts the held-out projections better. If the projections are too few to hold some out
-    and no `levels` are given, the result is the FISTA-TV volume, too. If the caller gives a volume to start from, the
-    method uses total variation alone. If no projections can be held out, but `levels` are given, voxels are pulled
-    weakly to these levels.
+    is the FISTA-TV volume if no discrete levels pass all tests with held-out projections, see `MaterialTrial.choose`.
+    If the projections are too few to hold some out and no `levels` are given, the result is the FISTA-TV volume, too.
+    If the caller gives a volume to start from, the method uses total variation alone. If no projections can be held
+    out, but `levels` are given, voxels are pulled weakly to these levels.
 
     Attributes:
         iterations: largest number of iterations over all projections, not counting the FISTA-TV iterations before them.

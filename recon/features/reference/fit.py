@@ -23,7 +23,7 @@ from recon.base.decisions import GoesOn
 from recon.features.reference.motion import KNOTS, Basis, MotionViews, Moved, improved
 from recon.features.reference.weights import ALL_LINES, falling
 from recon.kernels.cpu.two_tv import ascend, pace_of, primal
-from recon.voxels.half_voxels import DUAL_STEPS, means_of_four, repeated, subsets_on_halves, with_half_voxels
+from recon.voxels.half_voxels import DUAL_STEPS, on_half_voxels, repeated
 from recon.voxels.ordered_fista import SUBSETS, Subsets, ordered_fista, subsets_of
 from recon.voxels.priors import TvWeight
 from recon.voxels.voxel_problem import VoxelProblem, difference_weights
@@ -197,15 +197,16 @@ class StateFit:
         """
         if not self.going.going:
             return 0
-        own, change = self._weights(*falling(self.problem, self.moved, self.x, self.m))
-        fine, x = with_half_voxels(self.problem, self._done), repeated(self.x)
-        weights = difference_weights(fine.projector.grid)
-        prox = TwoVariations(x.shape, weights, fine.nonnegative, DUAL_STEPS * _STEPS)
-        prox.about(repeated(self.m), repeated(own), repeated(change))
-        del self._prox, own, change
-        subsets = subsets_on_halves(fine)
-        x = ordered_fista(fine, x, TvWeight(self.weight / 2), subsets, sweeps=most, prox=prox, still=_STILL)
-        self.x = means_of_four(x)
+        del self._prox
+
+        def prox_of(fine: VoxelProblem) -> TwoVariations:
+            own, change = self._weights(*falling(self.problem, self.moved, self.x, self.m))
+            m, weights = repeated(self.m), difference_weights(fine.projector.grid)
+            prox = TwoVariations(m.shape, weights, fine.nonnegative, DUAL_STEPS * _STEPS)
+            prox.about(m, repeated(own), repeated(change))
+            return prox
+
+        self.x = on_half_voxels(self.problem, self.x, self.weight, prox_of, done=self._done, sweeps=most, still=_STILL)
         ended = self.problem.decide.ended
         return 0 if ended is None else ended.after
 
