@@ -42,7 +42,8 @@ _HEAVIER = 1.75
 In the PSNR, the ground truth prefers 1.5 to 2 times that share. With 1.5 instead of 2, 16 scans of 192 and 512 columns
 change by -0.5 to +0.3 dB (mean -0.05), and cracks are deeper: those thinner than a voxel keep 0.68 instead of 0.58 of
 their depth (120 projections), and 0.58 instead of 0.41 (60 projections). 1.75 lies between the two in both. The factor
-1 costs up to 1.7 dB.
+1 costs up to 1.7 dB. On eleven scans of other packings, 1.75 instead of 2 changes the PSNR by -0.2 to +0.1 dB (median
+-0.1), and cracks thinner than a voxel keep 0.69 instead of 0.66 of their depth (60 projections).
 """
 
 
