@@ -19,7 +19,7 @@ from recon.base.volume import Volume
 from recon.features.discrete.choose import COUNTS, WEAK_PULL, MaterialTrial, pull_to
 from recon.features.discrete.mixture import NOISE, probabilities, undecided_share
 from recon.voxels.choice import Prediction, TrialChoice
-from recon.voxels.half_voxels import HalfVoxels
+from recon.voxels.half_voxels import FEW_WITH_LEVELS, HalfVoxels
 from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
 from recon.voxels.methods import EarlyTv, FistaTv
@@ -67,6 +67,8 @@ class Discrete(HalfVoxels):
         iterations: largest number of iterations over all projections, not counting the FISTA-TV iterations before them.
         levels: densities of the materials in 1/mm, ascending; None: found by expectation maximisation (EM).
         still, half_voxels: as in `FistaTv`.
+        few: half voxels are used with levels if the projections are fewer than this share of the columns; without
+            levels, the rule of `FistaTv` holds.
     """
 
     name: ClassVar[str] = "discrete"
@@ -75,6 +77,7 @@ class Discrete(HalfVoxels):
     halo: ClassVar[int] = FistaTv.halo + 12
     error_bars: ClassVar[tuple[float, float] | None] = 3.0, 0.2
     buffers: ClassVar[Buffers] = Buffers(10.6, 3.0, 4.8, filtered=True)
+    few: ClassVar[float] = FEW_WITH_LEVELS
     first_sweeps: ClassVar[int] = MOST_SWEEPS
 
     iterations: Count = MOST_SWEEPS
@@ -154,15 +157,16 @@ class Discrete(HalfVoxels):
         return replace(result, chosen=_NO_LEVELS)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
+        without_levels = FistaTv(self.iterations, still=self.still, half_voxels=self.half_voxels)
         if x.any():  # a pull would hide the noise that the refits for error bars must show
-            return FistaTv(self.iterations, still=self.still, half_voxels=self.half_voxels).iterate(problem, x)
+            return without_levels.iterate(problem, x)
         trial = cache(partial(Trial.of, problem))
         x, weight = FistaTv(still=self.still).with_weight(problem, x, trial)
         materials, mu = self.materials(problem, weight, trial), weight.value
         if not problem.go_on.going:
             return x
         if materials is None:
-            return self.in_half_voxels(problem, x, mu, TV_STEPS)
+            return without_levels.in_half_voxels(problem, x, mu, TV_STEPS)
         before = 0 if problem.decide.ended is None else problem.decide.ended.after
         x = self.pulled(problem, x, weight, materials, self.first_sweeps)
         if (ended := problem.decide.ended) is not None:

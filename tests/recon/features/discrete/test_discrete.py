@@ -17,7 +17,7 @@ from recon.voxels.methods import PnpDct
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
-VIEWS = recon.Geometry.parallel(np.arange(20) * np.pi / 20, (6, 64))
+VIEWS, MORE_VIEWS = (recon.Geometry.parallel(np.arange(n) * np.pi / n, (6, 64)) for n in (20, 40))
 GRID = recon.Grid.matching(VIEWS)
 
 
@@ -38,8 +38,8 @@ def smooth() -> F32:
     return ((0.03 + 0.01 * noise / noise.std()).clip(0) * (away < 28)).astype(np.float32)
 
 
-def measured(truth: F32) -> F32:
-    clean = Projector(VIEWS, GRID).forward(truth)
+def measured(truth: F32, geometry: recon.Geometry = VIEWS) -> F32:
+    clean = Projector(geometry, GRID).forward(truth)
     counts = np.random.default_rng(0).poisson(3e4 * np.exp(-clean.astype(float)))
     return -np.log(counts / 3e4).astype(np.float32)
 
@@ -76,10 +76,17 @@ def test_the_probability_of_each_material_is_there_on_demand(of_grains: recon.Re
 
 
 @pytest.mark.slow
-def test_smooth_matter_is_that_of_total_variation() -> None:
-    data = measured(smooth())
-    found = recon.reconstruct(data, VIEWS, recon.Discrete())
-    np.testing.assert_array_equal(found.volume.data, recon.reconstruct(data, VIEWS, recon.FistaTv()).volume.data)
+def test_with_levels_half_voxels_are_used_for_more_than_a_third_as_many_projections_as_columns() -> None:
+    result = recon.reconstruct(measured(grains(), MORE_VIEWS), MORE_VIEWS, recon.Discrete())
+    assert result.settings["half_voxel_iterations"] > 0 and not result.chosen
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("geometry", [VIEWS, MORE_VIEWS])
+def test_smooth_matter_is_that_of_total_variation(geometry: recon.Geometry) -> None:
+    data = measured(smooth(), geometry)
+    found = recon.reconstruct(data, geometry, recon.Discrete())
+    np.testing.assert_array_equal(found.volume.data, recon.reconstruct(data, geometry, recon.FistaTv()).volume.data)
     assert "levels_of_materials" not in found.settings
     assert found.chosen.startswith("this is the volume of fista-tv, because no discrete levels were found")
     assert recon.Discrete.probabilities(found.volume, found.settings) is None
