@@ -28,13 +28,13 @@ from scipy import ndimage as ndi
 import recon
 from recon.base.arrays import F32
 from recon.base.volume import Volume
-from tests.bench.operando_baselines import volumes
-from tests.bench.operando_scenes import SCENES, Judge, paint, scanned, scene
+from tests.bench.operando_baselines import of_series, volumes
+from tests.bench.operando_scenes import SCENES, Judge, State, paint, scanned, scene
 
 STATE = 3
 WEIGHTS = 3.5e-4, 7e-4, 1.4e-3, 2.8e-3, 5.6e-3  # of total variation; the best by the truth is the baseline
 REFERENCES = "right", "other", "shifted", "turned", "energy", "changed"
-BASELINES = "piccs", "dtv", "rest"
+BASELINES = "piccs", "dtv", "rest", "start", "series"
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,12 @@ class Case:
         return np.arange(self.views) * np.pi / self.views
 
 
+def scanned_before(before: State, seed: int) -> tuple[F32, NDArray[np.float64]]:
+    """Line integrals of the reference scan, and their angles."""
+    angles = np.arange(360) * np.pi / 360
+    return scanned(paint(before)[0], angles, 1e4, np.random.default_rng([3, seed])), angles
+
+
 @cache
 def reference(name: str, kind: str, seed: int, columns: int, rows: int) -> Volume:
     """The volume of 360 views of the scene before it changed, or another one."""
@@ -62,8 +68,7 @@ def reference(name: str, kind: str, seed: int, columns: int, rows: int) -> Volum
         before = replace(before, balls=balls, matrix=(before.matrix[0], before.matrix[1] * 0.9), can=can)
     if kind == "changed":
         before = replace(before, balls=_mostly_changed(before.balls, np.random.default_rng([5, seed])))
-    angles = np.arange(360) * np.pi / 360
-    lines = scanned(paint(before)[0], angles, 1e4, np.random.default_rng([3, seed]))
+    lines, angles = scanned_before(before, seed)
     made = recon.reconstruct(lines, recon.Geometry.parallel(angles, lines.shape[1:]), recon.FistaTv()).volume
     if kind == "shifted":
         made = replace(made, data=np.roll(made.data, (6, -8), (1, 2)))
@@ -105,6 +110,8 @@ def row_of_baselines(case: Case) -> str:
     if made.change is None:
         return f"{begin}not used |" + " |" * (3 * len(BASELINES) + 3)
     others = volumes(lines, geometry, replace(made.volume, data=made.volume.data - made.change.data))
+    before = scene(case.scene, case.columns, case.rows, case.seed)[0][0]
+    others["series"] = [of_series(*scanned_before(before, case.seed), lines, geometry)]
     best = [max(others[name], key=judge.psnr) for name in BASELINES]
     return f"{begin}used | {' | '.join(_cells(judge, x) for x in (*best, made.volume.data))} |"
 

@@ -1,8 +1,12 @@
-"""Published ways to use a reference that was moved to the state already; their weights are chosen with the truth.
+"""Published ways to use a reference; their weights are chosen with the truth.
 
-piccs: the mean of the total variations of the volume and of its difference from the reference (Chen, Tang & Leng 2008,
-Med. Phys. 35, 660). dtv: total variation without the differences along the gradient of the reference (Ehrhardt &
-Betcke 2016, SIAM J. Imaging Sci. 9, 1084). rest: the reference plus FBP of what it leaves of the projections.
+All but the last get the reference that was moved to the state already. piccs: the mean of the total variations of the
+volume and of its difference from the reference (Chen, Tang & Leng 2008, Med. Phys. 35, 660). dtv: total variation
+without the differences along the gradient of the reference (Ehrhardt & Betcke 2016, SIAM J. Imaging Sci. 9, 1084).
+rest: the reference plus FBP of what it leaves of the projections. start: a few iterations of total variation that begin
+with the reference, as `init_recon` of mbirjax allows; their number is chosen with the truth, too. series: one fit of
+the projections of the reference scan and of the state (`recon.fit_series`); held-out projections choose its weight, and
+whether the sample moved.
 """
 
 from __future__ import annotations
@@ -11,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 import recon
 from recon.base.arrays import F32
@@ -20,12 +25,14 @@ from recon.base.volume import Volume
 from recon.features.reference.fit import TwoVariations
 from recon.voxels.iterative import solve_views
 from recon.voxels.ordered_fista import Prox, Subsets, ordered_fista, subsets_of
-from recon.voxels.priors import TvWeight
+from recon.voxels.priors import TvWeight, tv_prox
 from recon.voxels.projector import Projector
+from recon.voxels.trial import TV_STEPS
 from recon.voxels.voxel_problem import VoxelProblem, difference_weights, times_power
 
 WEIGHTS = 1e-2, 5e-3, 2.5e-3, 1.25e-3  # μ for each projection, the largest first; a volume begins with the one before
 SWEEPS, STILL = 30, 2e-3  # at most, and the change of a volume that has converged
+START_SWEEPS = 2, 5, 10
 _STEPS = 8  # dual steps of a proximal step
 _SMOOTH = 0.02  # slope of the reference, divided by its highest level, that halves what dtv takes away
 
@@ -42,7 +49,34 @@ def volumes(lines: F32, geometry: recon.Geometry, moved: Volume) -> dict[str, li
         for weight in WEIGHTS:
             state.weight = weight * geometry.n_views
             made[name].append(solve_views(state, projector, views).data)
+    made["start"] = [
+        solve_views(_Started(m, weight * geometry.n_views, sweeps), projector, views).data
+        for weight in WEIGHTS for sweeps in START_SWEEPS
+    ]  # fmt: skip
     return made
+
+
+def of_series(before: F32, angles: NDArray[np.float64], lines: F32, geometry: recon.Geometry) -> F32:
+    """The volume [z, y, x] of the state from one fit of its projections and of those of the reference scan."""
+    both = recon.Geometry.parallel(np.concatenate([angles, geometry.angles]), lines.shape[1:])
+    times = np.repeat([0.0, 1.0], [len(before), len(lines)])
+    return recon.fit_series(recon.TimedViews(np.concatenate([before, lines]), both, times), 2).at(1.0)
+
+
+@dataclass(frozen=True)
+class _Started:
+    """Total variation of one weight, a few sweeps from the reference m [y, x, z]."""
+
+    m: F32
+    weight: float
+    sweeps: int
+
+    def iterate(self, problem: VoxelProblem, x: F32) -> F32:
+        m = times_power(self.m.copy(), -problem.units.density)
+        weight = problem.units.prior(Prior(self.weight), problem.weight is not None, -1).weight
+        subsets = Subsets.of(problem, subsets_of(problem.projector.geometry))
+        return ordered_fista(problem, m, TvWeight(weight), subsets, sweeps=self.sweeps,
+                             prox=tv_prox(problem, TV_STEPS), still=0.0)  # fmt: skip
 
 
 @dataclass
