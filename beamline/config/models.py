@@ -442,8 +442,8 @@ class Config(Section):
         energies = self.scan.energies or ([] if self.scan.energy is None else [self.scan.energy])
         if energies and isinstance(device, NoMonochromator):
             raise ValueError(
-                f"{name} needs a monochromator, but devices.monochromator.kind is none; set a kind of monochromator, "
-                f"or set {name} to null"
+                f"{name} sets an energy, but no monochromator is configured (devices.monochromator.kind: none). Set "
+                f"devices.monochromator.kind to the type of your monochromator, or set {name} to null"
             )
         low, high = getattr(device, "range_kev", None) or (0.0, math.inf)
         if beyond := [energy for energy in energies if not low <= energy <= high]:

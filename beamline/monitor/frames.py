@@ -132,7 +132,7 @@ class TimingCheck(Logged):
 
     warn: float = setting(
         0.25,
-        "largest time by which a frame may be early or late, as a fraction of the time between two projections",
+        "how early or late a frame may arrive without a warning, as a fraction of the time between two projections",
         ge=0,
     )
 

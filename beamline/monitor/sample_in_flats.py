@@ -202,8 +202,9 @@ def views_show_nothing(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     if all(most < limit for most, limit in zip(shown, limits, strict=True)):
         yield BadFrames((), max(shown), max(limits), (
             "The projections show no sample: the projections that were checked differ from the flats only by noise "
-            f"(line integrals below {max(shown):.2g}). Either there is no sample, or the sample was also in the beam "
-            "during the flats and looks the same from all sides."
+            f"(all line integrals are below {max(shown):.2g}). Check whether the sample was in the field of view. If "
+            "it was, it was also in the beam during the flats and looks the same from all sides: take new flats "
+            "without the sample."
         ))  # fmt: skip
 
 

@@ -257,14 +257,13 @@ def _steady(
         size = odd
         odd_frame = frames[outlier]
         what = (
-            f"The whole frame {odd_frame} is brighter or darker than the frames at neighbouring angles: the median "
-            f"of its line integrals differs from the medians of those frames by {odd:.2f} more than other frames of "
-            "this scan do"
+            f"Frame {odd_frame} as a whole is brighter or darker than the frames at neighbouring angles: the median "
+            f"of its line integrals jumps by {odd:.2f} more than is usual between neighbouring frames of this scan"
         )
     sentence = (
-        f"{what}, and there is no air next to the sample to correct the intensity. Intensity, exposure, energy or "
-        "filter changed, or some projections belong to another scan. Use --views to choose projections that belong "
-        "together, or --air to state which columns are air."
+        f"{what}. The intensity, the exposure time, the energy or the filter changed, or some projections belong to "
+        "another scan. The program cannot correct this, because no detector column shows air next to the sample. Use "
+        "--views to choose projections that belong together, or --air to state which columns are air."
     )
     return ConsistencyCondition("light of opposite views", size, _STEP_OF_LIGHT, "in line integral", sentence)
 

@@ -195,8 +195,8 @@ def uncorrected_current(scan: SelectedScan) -> str:
     variation = currents.max() / currents.min() - 1
     return (
         f"Use --ring-current use: the ring current of flats and projections (control/data) varies by {variation:.0%} "
-        f"(from {currents.min():.6g} to {currents.max():.6g}), and there is no air next to the sample to correct "
-        "this."
+        f"(from {currents.min():.6g} to {currents.max():.6g}). Without this option, the change is not corrected, "
+        "because no detector column shows air next to the sample."
     )
 
 

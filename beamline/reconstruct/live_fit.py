@@ -137,9 +137,9 @@ class ScanFollower:
         usable = checked_views(scan, live.warn)
         if not isinstance(self.state, Feeds):
             raise DataError(
-                f"{live.source.path}: the live fit has taken none of the {usable.frames.size} projections that can "
-                f"be used (--views {live.selection.views}). Select other projections with --views, or reconstruct "
-                "the finished scan without --follow. Nothing was written."
+                f"{live.source.path}: the scan ended before the live fit had read any of its {usable.frames.size} "
+                f"usable projections (--views {live.selection.views}), so there is no live volume, and nothing was "
+                "written. Reconstruct the finished scan without --follow, or select other projections with --views."
             )
         return ended(live, self.state, scan, usable)
 

@@ -272,16 +272,20 @@ def _angles_finding(scan: ScanEvidence, degrees: NDArray[np.float64], turn: _Tur
     known = [factor for factor in _FACTORS if abs(turn.degrees - 180 * factor) < np.ptp(degrees) / VIEWS]
     counted = np.allclose(degrees, np.arange(degrees.size))
     if counted:
-        unit = "the values are 0, 1, 2 and so on, so these values are frame numbers"
+        unit = "the values are 0, 1, 2 and so on, so they are frame numbers"
     else:
         times = 180 / turn.degrees
-        unit = f"the angles look {times:.3g} times as large as stated"
+        unit = f"the true angles are probably {times:.3g} times the stated angles"
     pairs = (
-        f"Frames {turn.alike[0]} and {turn.alike[1]} are mirror images, as projections 180 degrees apart are, but "
-        f"the stated angles are {turn.degrees:.4g} degrees apart"
+        f"Frames {turn.alike[0]} and {turn.alike[1]} are mirror images of each other. Two projections are mirror "
+        f"images if the sample turned by 180 degrees between them, but the stated angles of these frames differ by "
+        f"{turn.degrees:.4g} degrees"
     )
     if turn.stated is not None:
-        pairs += f"; frames {turn.stated[0]} and {turn.stated[1]}, stated 180 degrees apart, are not mirror images"
+        pairs += (
+            f". Frames {turn.stated[0]} and {turn.stated[1]}, whose stated angles differ by 180 degrees, are not "
+            "mirror images"
+        )
     # A plan belongs to a scan of this program, whose angles are in degrees. If no projections have stated angles 180
     # degrees apart, a symmetric sample may look the same, too. Mistakes are by one of these factors, while a moving
     # sample may repeat after any angle.

@@ -158,7 +158,7 @@ def test_without_contrast_in_the_middle_these_slices_are_named(here: Path) -> No
     np.save(here / "can.npy", volume)
     common = ("structure", "can.npy", *VOXEL_UM, "--quick", "--crop", "none", "--memory", "16M")
     result = beamline(*common)
-    words = "expected at most 1.5 times; only slices 14:26 fit into the memory and were measured: give more --memory, or"
+    words = "expected at most 1.5 times; only slices 14:26 fit into the memory and were measured: give more --memory"
     assert result.exit_code == 5 and words in result.stderr
     assert "views" not in result.stderr and "--materials" not in result.stderr
     assert "--slices, or give fewer --materials. Nothing" in beamline(*common, "--materials", "3").stderr

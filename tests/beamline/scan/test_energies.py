@@ -168,7 +168,7 @@ def test_a_dry_run_counts_all_energies(config: Path, tmp_path: Path) -> None:
         (("scan.energies=[8.3, 8.3]",), "lists 8.3 keV twice"),
         (("scan.energies=[8.3, 8.30000000001]",), "keV twice (rounded to seven digits)"),
         (("scan.energy=8.3",), "exclude each other"),
-        (("devices.monochromator={kind: none}",), "scan.energies needs a monochromator"),
+        (("devices.monochromator={kind: none}",), "scan.energies sets an energy, but no monochromator is configured"),
         (("devices.monochromator={kind: simulated, range_kev: [8, 8.35]}",), "8.352 keV is not within"),
         (("recon.live=true", "scan.decide=do"), "set scan.energies to null"),
         (("simulation.scene.beam.energy_kev=null", "simulation.scene.beam.tube={kv: 60}"), "gives a single energy"),
