@@ -23,7 +23,7 @@ from drivers.base.clock import Clock, SystemClock
 if TYPE_CHECKING:
     from beamline.monitor.check import Check, Level
     from beamline.monitor.references import ReferenceLimits
-    from beamline.projections.replay import FrameVerdict, Kind, ScanVerdict
+    from beamline.projections.replay import FlagKind, FrameVerdict, ScanVerdict
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +140,7 @@ def _watched(
         for judged in replay(source, checks, follow=follow, should_stop=stopped):
             frames.append(judged)
             if not request.follow:
-                progress(len(frames), judged.n)
+                progress(len(frames), judged.n_frames)
             now = {(flag.check, flag.level) for flag in judged.flags}
             for flag in judged.flags:
                 if (flag.check, flag.level) not in active:
@@ -169,7 +169,7 @@ def _facts(file: Path, summed: ScanVerdict) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def table(kinds: Iterable[Kind]) -> list[str]:
+def table(kinds: Iterable[FlagKind]) -> list[str]:
     """The flags as text, with three lines for each check and level."""
     from beamline.monitor.checks import CHECKS
 

@@ -19,7 +19,7 @@ from beamline.projections.registry import registered, steps_of
 from beamline.projections.step import Option, options_of
 
 if TYPE_CHECKING:
-    from beamline.projections.scan_statistics import LightAsked
+    from beamline.projections.scan_statistics import DoseRequest
     from beamline.projections.selection import Selection
     from beamline.storage.readers.open import SourceOptions
 
@@ -155,7 +155,7 @@ light_options = together(
 """The options whose values `light_asked` uses."""
 
 
-def light_asked(photons_per_count: float | None, dose_in: str | None) -> LightAsked | None:
+def light_asked(photons_per_count: float | None, dose_in: str | None) -> DoseRequest | None:
     """Photons per count and material for the dose; None without --photons-per-count.
 
     Raises:
@@ -165,9 +165,9 @@ def light_asked(photons_per_count: float | None, dose_in: str | None) -> LightAs
         if dose_in is not None:
             raise click.UsageError("--dose-in needs --photons-per-count.")
         return None
-    from beamline.projections.scan_statistics import LightAsked  # imported here because it loads matplotlib and numba
+    from beamline.projections.scan_statistics import DoseRequest  # imported here because it loads matplotlib and numba
 
-    return LightAsked(photons_per_count, dose_in)
+    return DoseRequest(photons_per_count, dose_in)
 
 
 def span(value: str) -> tuple[int, int]:

@@ -227,7 +227,7 @@ class ShownScan:
             return data[:, row - self._band.start]
         turned = TiltAndLens(tilt_deg).of(self._scan)
         assert turned is not None
-        (rows,), (cols,) = turned.places((1, data.shape[2]), row)
+        (rows,), (cols,) = turned.positions((1, data.shape[2]), row)
         rows, cols = np.clip(rows - self._band.start, 0, data.shape[1] - 1), np.clip(cols, 0, data.shape[2] - 1)
         r, c = (
             np.minimum(positions, n - 2).astype(int) for positions, n in ((rows, data.shape[1]), (cols, data.shape[2]))

@@ -74,7 +74,7 @@ def rotation_axis(
     if axis_col is None and not straight:
         axis_col, axis = _axis_by_views(scan, usable.frames, poses, warn, progress)
     elif axis_col is None:
-        located = _axis_beside_jumps(plan, usable, warn, progress)
+        located = _axis_between_jumps(plan, usable, warn, progress)
         axis_col, axis = located.col, located.estimate
         if located.warning:
             warn(located.warning)
@@ -88,10 +88,10 @@ def _compare_with_views(stated_col: float, plan: ScanCorrectionPlan, frames: NDA
     """Warn if some projections clearly show another axis than the axis that the user gave."""
     with suppress(DataError):
         compared_frames = spread(frames, _COMPARED)
-        shown = locate_axis(plan, compared_frames, all_there=False)
-        if shown.estimate.confident and abs(shown.col - stated_col) > AGREE * plan.scan.selection.binning:
+        located = locate_axis(plan, compared_frames, complete=False)
+        if located.estimate.confident and abs(located.col - stated_col) > AGREE * plan.scan.selection.binning:
             warn(
-                f"Check --axis: the projections show the rotation axis at column {shown.col:.2f}, but "
+                f"Check --axis: the projections show the rotation axis at column {located.col:.2f}, but "
                 f"{stated_col:g} was given. Columns are counted from 0 at the centre of the first column. "
                 "Unless the sample moved, omit --axis, or compare columns with `beamline sweep FILE "
                 "axis=A:B:STEP`."
@@ -121,8 +121,8 @@ def _axis_by_views(
     if poses is not None:
         poses, frames = replace(poses, pivot=coarse.selection.pivot, binning=binning), frames[poses.stated(frames)]
     views = line_integrals_of(coarse, spread(frames, VIEWS))
-    begin = (cols - 1) / 2 if stated is None else stated
-    geometry = coarse.selection.geometry(begin, source.table.angles[views.view_ids])
+    first_guess = (cols - 1) / 2 if stated is None else stated
+    geometry = coarse.selection.geometry(first_guess, source.table.angles[views.view_ids])
     if poses is not None:
         geometry = poses.corrected(geometry, views.view_ids)
     try:
@@ -153,7 +153,7 @@ def _axis_by_views(
     return axis_col, estimate
 
 
-def _axis_beside_jumps(
+def _axis_between_jumps(
     plan: ScanCorrectionPlan,
     usable: UsableViews,
     warn: Warn | None,
@@ -179,12 +179,12 @@ def locate_axis(
     warn: Warn | None = None,
     progress: Callable[[int, int], None] = lambda n, total: None,
     *,
-    all_there: bool = True,
+    complete: bool = True,
 ) -> LocatedAxis:
     """Find the rotation axis from a band of rows of projections spread over `frames`; `warn` as in `apply`.
 
     If the estimate has no clear optimum, the axis stated in the file is used. If the file states none and the
-    projections are `all_there`, held-out projections find the axis. Held-out projections would mislead if only a part
+    projections are `complete`, held-out projections find the axis. Held-out projections would mislead if only a part
     of the rotation was measured, or only 180 degrees of a sample wider than the field of view.
 
     Raises:
@@ -195,8 +195,8 @@ def locate_axis(
     frames = spread_views(source.table.angles[frames], _AXIS_VIEWS, frames)
     band = apply(plan, frames, slice(start, min(height, start + _AXIS_ROWS)), warn, progress)
     # columns behind slits that were replaced; their noise would strongly affect the axis
-    hidden = band.masked.all(axis=0)
-    exposed_cols = np.flatnonzero(~hidden | hidden.all())
+    masked_cols = band.masked.all(axis=0)
+    exposed_cols = np.flatnonzero(~masked_cols | masked_cols.all())
     angles = source.table.angles[band.view_ids]
     try:
         estimate = find_axis(np.ascontiguousarray(band.data[..., exposed_cols[0] : exposed_cols[-1] + 1]), angles)
@@ -207,9 +207,9 @@ def locate_axis(
             estimate = find_axis(band.data, angles)
     except ValueError as error:
         raise _not_found(source, error) from error
-    unsure = not estimate.confident and source.axis_col is None and estimate.method != ENDS
-    if all_there and (unsure or _hides_matter(band)):
-        estimate = _by_unseen_views(band, angles) or estimate
+    uncertain = not estimate.confident and source.axis_col is None and estimate.method != ENDS
+    if complete and (uncertain or _material_was_guessed(band)):
+        estimate = _by_held_out_views(band, angles) or estimate
     axis_col = unbinned(estimate.value, binning)
     if estimate.confident:
         return LocatedAxis(axis_col, estimate)
@@ -223,14 +223,14 @@ def locate_axis(
     )
 
 
-def _hides_matter(band: Projections) -> bool:
+def _material_was_guessed(band: Projections) -> bool:
     """True if parts of rows without data were filled with sample material. The position of this material is a guess."""
     if not band.unmeasured.size or (exposed := band.lit) is None:
         return False
     return bool(band.data[~exposed & exposed.any(axis=2, keepdims=True)].sum() > _GUESSED * band.data.sum())
 
 
-def _by_unseen_views(band: Projections, angles: NDArray[np.float64]) -> AxisEstimate | None:
+def _by_held_out_views(band: Projections, angles: NDArray[np.float64]) -> AxisEstimate | None:
     """The axis if the sample is wider than the field of view, or if a part of the detector has no beam. None: the axis
     was not found.
 
@@ -239,15 +239,15 @@ def _by_unseen_views(band: Projections, angles: NDArray[np.float64]) -> AxisEsti
     """
     if band.data.shape[1] < band.data.shape[2] // COLS:
         return None  # otherwise columns would not be binned, and volumes would take minutes
-    dark, view_numbers, exposed = areas(band.masked), spread(np.arange(angles.size), VIEWS), band.lit
+    without_beam, view_numbers, exposed = areas(band.masked), spread(np.arange(angles.size), VIEWS), band.lit
     data = np.ascontiguousarray(band.data[view_numbers])
     with suppress(ValueError):
         estimate = axis_by_views(
             data, Geometry.parallel(angles[view_numbers], data.shape[1:]),
             lit=None if exposed is None else exposed[view_numbers],
         )  # fmt: skip
-        if estimate.confident or dark.any():
-            return replace(estimate, confident=not dark.any())
+        if estimate.confident or without_beam.any():
+            return replace(estimate, confident=not without_beam.any())
     return None
 
 

@@ -21,15 +21,15 @@ from beamline.projections.protocols import CountsStep
 from beamline.projections.read import (
     ViewFilters,
     damaged_frames,
+    no_beam_sentence,
     no_view,
     read_views,
     reading_memory,
-    unlit_sentence,
 )
 from beamline.projections.references import (
-    current_scale,
+    current_factors,
     flats_sentence,
-    light_scale,
+    intensity_factors_of,
     parts_without_flats,
     read_references,
     with_dynamic_flats,
@@ -64,8 +64,8 @@ class ScanCorrectionPlan:
         settings: settings of the conversion of counts.
         references: darks and flats of the rows that are read, binned; None: the frames are already line integrals.
         photons: how pixels count photons; None: logarithms are taken.
-        light: float64 [frame], factor that scales the frame to the usual exposure and, on request, to the median ring
-            current; None: 1 for all.
+        intensity_factors: float64 [frame], factor that scales the frame to the usual exposure and, on request, to the
+            median ring current; None: 1 for all.
         shadow: objects in the beam of all projections; None: not searched for, or too few projections.
         beam_done: what was done about flats, defects and noise, as texts by name.
         warnings: sentences on damaged references, on zingers in them, and on parts of the scan without flats.
@@ -75,7 +75,7 @@ class ScanCorrectionPlan:
     settings: CorrectionSettings
     references: References | None = None
     photons: Photons | None = None
-    light: F64 | None = None
+    intensity_factors: F64 | None = None
     shadow: Shadow | None = None
     beam_done: Mapping[str, StepDone] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
@@ -103,16 +103,16 @@ class ScanCorrectionPlan:
             ValueError: references that cannot be used.
         """
         read = self.filters.within(rows)
-        standing, foreign = (None, None) if self.shadow is None else (part[read] for part in self.shadow)
+        shadow, foreign = (None, None) if self.shadow is None else (part[read] for part in self.shadow)
         if self.references is None:
             return LinesPlan.of(self.settings.zinger_threshold, foreign)
         return counts_plan.survey(
             self.references.rows(read),
             self.settings,
-            standing=standing,
+            shadow=shadow,
             photons=self.photons,
             foreign=foreign,
-            light=self.light,
+            intensity_factors=self.intensity_factors,
         )
 
 
@@ -144,8 +144,8 @@ def survey(scan: SelectedScan, views: NDArray[np.int64] = NO_VIEWS) -> ScanCorre
     elif preparation.noise == "counts":
         raise ConfigError(f"Omit --noise counts: {source.path} contains line integrals, not counts.")
     elif preparation.by_current:
-        current_scale(scan.evidence)  # raises an error if the file has no ring current
-    return in_shadow(plan, views) if views.size else plan
+        current_factors(scan.evidence)  # raises an error if the file has no ring current
+    return with_shadow(plan, views) if views.size else plan
 
 
 def _with_references(plan: ScanCorrectionPlan, scan: SelectedScan) -> ScanCorrectionPlan:
@@ -153,35 +153,42 @@ def _with_references(plan: ScanCorrectionPlan, scan: SelectedScan) -> ScanCorrec
     model.
     """
     read, preparation, evidence = plan.filters.read(None), scan.selection.step(Preparation), scan.evidence
-    light = light_scale(evidence, preparation.by_current) if preparation.by_current or evidence.views_differ else None
+    scaled = preparation.by_current or evidence.views_differ
+    factors = intensity_factors_of(evidence, preparation.by_current) if scaled else None
     references, note = read_references(scan, read)
     if preparation.flat_fields == "dynamic":
         references = with_dynamic_flats(scan, references, read)
-    _, damaged = damaged_frames(scan, np.concatenate([*evidence.used.darks, *evidence.used.flats]))
+    _, damaged = damaged_frames(
+        scan, np.concatenate([*evidence.used_references.darks, *evidence.used_references.flats])
+    )
     photons = photons_of(scan, references)
     flats, noise = flats_sentence(evidence, references, preparation.by_current), noise_sentence(references, photons)
-    recorded = {name: each if isinstance(each, float) else str(each) for name, each in asdict(plan.settings).items()}
-    del recorded["sample_from"]  # the line follows from --air
+    stated_settings = {
+        name: each if isinstance(each, float) else str(each) for name, each in asdict(plan.settings).items()
+    }
+    del stated_settings["sample_from"]  # the line follows from --air
     done = {
-        "defects": StepDone(parameters={f"correction_{name}": value for name, value in recorded.items()}),
+        "defects": StepDone(parameters={f"correction_{name}": value for name, value in stated_settings.items()}),
         "flats": StepDone(flats, {"flats": flats or preparation.flat_fields}),
         "noise": StepDone(noise, {"noise": noise or "logarithms of counts"}),
     }
     warnings = (*plan.warnings, *([note] if note else []), *damaged, *parts_without_flats(evidence, references))
-    return replace(plan, references=references, photons=photons, light=light, beam_done=done, warnings=warnings)
+    return replace(
+        plan, references=references, photons=photons, intensity_factors=factors, beam_done=done, warnings=warnings
+    )
 
 
-def in_shadow(plan: ScanCorrectionPlan, views: NDArray[np.int64]) -> ScanCorrectionPlan:
+def with_shadow(plan: ScanCorrectionPlan, views: NDArray[np.int64]) -> ScanCorrectionPlan:
     """The plan with the objects that stand in the beam of all projections of a finished scan, found in some of these
     (rows of the file).
     """
-    where = plan.source, views, plan.filters.read(None), plan.scan.selection.binning
+    pixels = plan.source, views, plan.filters.read(None), plan.scan.selection.binning
     if not plan.source.finished:
         return plan
     if plan.references is None:
-        return replace(plan, shadow=shadow_on_lines(*where))
-    with refused(plan):
-        return replace(plan, shadow=shadow_on_counts(*where, plan.references, plan.settings))
+        return replace(plan, shadow=shadow_on_lines(*pixels))
+    with as_data_error(plan):
+        return replace(plan, shadow=shadow_on_counts(*pixels, plan.references, plan.settings))
 
 
 def with_filters_of(plan: ScanCorrectionPlan, scan: SelectedScan, views: NDArray[np.int64]) -> ScanCorrectionPlan:
@@ -197,7 +204,7 @@ def with_filters_of(plan: ScanCorrectionPlan, scan: SelectedScan, views: NDArray
 
 
 @contextmanager
-def refused(plan: ScanCorrectionPlan) -> Iterator[None]:
+def as_data_error(plan: ScanCorrectionPlan) -> Iterator[None]:
     """Turn a ValueError about the numbers into a DataError that names the file."""
     try:
         yield
@@ -236,7 +243,7 @@ def apply(
     data, usable = read_usable(plan, frames, rows, warn, lambda n, total: progress(n // steps, total))
     if not (n := usable.size):
         raise no_view(plan.scan.evidence, plan.references)
-    with refused(plan):
+    with as_data_error(plan):
         order, positions = by_angle(plan.source.table, usable), usable.astype(np.float64)
         lines, _ = correct.apply(
             data, positions, plan.of_rows(rows), usable, progress=lambda done: progress((n + done) // _STEPS, n),
@@ -266,14 +273,14 @@ def apply_in_batches(
             f"{plan.source.path}: --noise counts needs all projections in memory. Give --noise log, or --bin "
             f"{larger_bin}."
         )
-    in_time, frames = np.sort(frames), frames[by_angle(plan.source.table, frames)]
+    frames_by_time, frames = np.sort(frames), frames[by_angle(plan.source.table, frames)]
     parts, batches = np.split(frames, np.arange(batch, frames.size, batch)), list[Projections]()
     passes, warn_again = (1, warn) if plan.references is None else (2, None)
 
     def done(parts: int, before: int) -> None:
         progress(before * frames.size + min(parts * batch, frames.size), passes * frames.size)
 
-    with refused(plan):
+    with as_data_error(plan):
         of_rows = plan.of_rows(None)
         if isinstance(of_rows, CorrectionPlan):
             parts, of_rows = _with_air_found(plan, parts, of_rows, warn, lambda n: done(n, 0))
@@ -281,17 +288,17 @@ def apply_in_batches(
             pixels = read_views(plan.filters, plan.references, part, None, warn_again)
             lines, of_rows = apply_next(plan, *pixels, of_rows, last=n == len(parts))
             if lines is not None:
-                out[np.searchsorted(in_time, lines.view_ids)] = lines.data
+                out[np.searchsorted(frames_by_time, lines.view_ids)] = lines.data
                 batches.append(replace(lines, data=np.empty((0, *out.shape[1:]), np.float32)))
                 done(n, passes - 1)
     ids = np.sort(np.concatenate([part.view_ids for part in batches])) if batches else frames[:0]
-    if warn is not None and (sentence := unlit_sentence(plan.scan.evidence, in_time, ids)):
+    if warn is not None and (sentence := no_beam_sentence(plan.scan.evidence, frames_by_time, ids)):
         warn(sentence)
     if not ids.size:
         raise no_view(plan.scan.evidence, plan.references)
-    for row, place in enumerate(np.searchsorted(in_time, ids)):  # without the projections that are left out
-        if row != place:
-            out[row] = out[place]
+    for row, stored_row in enumerate(np.searchsorted(frames_by_time, ids)):  # without the projections that are left out
+        if row != stored_row:
+            out[row] = out[stored_row]
     masked = np.logical_and.reduce([part.masked for part in batches])
     merged = merge_and_empty(batches, out[: ids.size])
     return replace(merged, masked=masked, view_ids=ids, air=merged.air[np.argsort(merged.view_ids)])
@@ -327,7 +334,7 @@ def read_usable(
     """
     data, usable = read_views(plan.filters, plan.references, frames, rows, warn, progress)
     # a band of rows is not enough to decide whether a projection is usable
-    if warn is not None and rows is None and (sentence := unlit_sentence(plan.scan.evidence, frames, usable)):
+    if warn is not None and rows is None and (sentence := no_beam_sentence(plan.scan.evidence, frames, usable)):
         warn(sentence)
     return data, usable
 
@@ -367,7 +374,7 @@ def flats_as_projections(plan: ScanCorrectionPlan, most: int) -> NDArray[np.floa
     if plan.references is None:
         return np.zeros((0, 0, 0), np.float32)
     evidence = plan.scan.evidence
-    flats = evidence.used.flats[-1][:most]
+    flats = evidence.used_references.flats[-1][:most]
     exposures = float(np.median(plan.source.table.exposures[flats])) / evidence.usual_exposure
     return apply(plan, flats).data * np.float32(math.sqrt(exposures) if exposures > 0 else 1.0)
 
@@ -378,12 +385,12 @@ def by_angle(table: FrameTable, frames: NDArray[np.int64]) -> NDArray[np.intp]:
     It is the order of the scan, except in two cases: the scan skips angles, or the sample is offset in some frames.
     Offset frames are then grouped.
     """
-    angles, places = table.angles[frames], np.zeros(frames.size)
+    angles, offsets = table.angles[frames], np.zeros(frames.size)
     if table.aside is not None:
-        places = np.nan_to_num(table.aside[frames])
+        offsets = np.nan_to_num(table.aside[frames])
     steps = np.diff(np.unwrap(angles))
-    in_time = ((steps >= 0).all() or (steps <= 0).all()) and not np.diff(places).any()
-    return np.arange(frames.size) if in_time else np.lexsort((angles, places))
+    one_sense = ((steps >= 0).all() or (steps <= 0).all()) and not np.diff(offsets).any()
+    return np.arange(frames.size) if one_sense else np.lexsort((angles, offsets))
 
 
 def at_once_memory(scan: SelectedScan, frames: int, rows: slice | None = None) -> int:

@@ -14,10 +14,10 @@ from beamline.projections.correction import (
     NO_VIEWS,
     ScanCorrectionPlan,
     apply_next,
+    as_data_error,
     by_angle,
-    in_shadow,
     read_usable,
-    refused,
+    with_shadow,
 )
 from recon.prep.correct import Plan
 from recon.prep.projections import Projections
@@ -34,13 +34,13 @@ class FedCorrection:
         plan: plan of the correction.
         stream: the plan from `recon.prep` with the projections added so far; None: no projection was added.
         columns: air columns with which the projections were corrected.
-        fed: int64 [view], rows of the file that were added and can be used.
+        added: int64 [view], rows of the file that were added and can be used.
     """
 
     plan: ScanCorrectionPlan
     stream: Plan | None = None
     columns: frozenset[tuple[int, int]] = frozenset()
-    fed: NDArray[np.int64] = field(default_factory=NO_VIEWS.copy)
+    added: NDArray[np.int64] = field(default_factory=NO_VIEWS.copy)
 
 
 def feed(
@@ -59,9 +59,9 @@ def feed(
     """
     plan = state.plan
     data, usable = read_usable(plan, frames, None, warn)
-    with refused(plan):
+    with as_data_error(plan):
         lines, stream = apply_next(plan, data, usable, state.stream or plan.of_rows(None), last)
-    state = replace(state, stream=stream, fed=np.append(state.fed, usable))
+    state = replace(state, stream=stream, added=np.append(state.added, usable))
     if lines is None or not lines.view_ids.size:
         return None, state
     return lines, replace(state, columns=state.columns | {lines.air_columns})
@@ -72,8 +72,8 @@ def newest_lines(state: FedCorrection) -> Projections | None:
 
     The projection keeps waiting, because all of its zingers can only be found when both neighbours are known.
     """
-    none = np.empty((0, 0, 0), np.float32)
-    return None if state.stream is None else apply_next(state.plan, none, NO_VIEWS, state.stream, last=True)[0]
+    no_pixels = np.empty((0, 0, 0), np.float32)
+    return None if state.stream is None else apply_next(state.plan, no_pixels, NO_VIEWS, state.stream, last=True)[0]
 
 
 def outdated(state: FedCorrection) -> bool:
@@ -82,7 +82,7 @@ def outdated(state: FedCorrection) -> bool:
     """
     plan = state.plan
     finds_spots = np.isfinite(plan.settings.zinger_threshold)
-    if finds_spots and (np.diff(by_angle(plan.source.table, state.fed)) != 1).any():
+    if finds_spots and (np.diff(by_angle(plan.source.table, state.added)) != 1).any():
         return True
     if plan.references is None or state.stream is None:
         return False
@@ -94,5 +94,5 @@ def ignores_shadow(state: FedCorrection, views: NDArray[np.int64]) -> bool:
     """True if an object that is in the beam of all these projections of a finished scan was treated as part of the
     sample.
     """
-    shadow = None if state.plan.shadow is not None else in_shadow(state.plan, views).shadow
+    shadow = None if state.plan.shadow is not None else with_shadow(state.plan, views).shadow
     return shadow is not None and any(part.any() for part in shadow)

@@ -99,10 +99,10 @@ def photons_of(scan: SelectedScan, references: References) -> Photons | None:
     spoilt = spoilt_frames(source, not model.uses_flags)
     flats, darks = (
         read_binned(source, np.setdiff1d(max(groups, key=len), spoilt)[:_TRANSFER_FRAMES], middle, binning)
-        for groups in (scan.evidence.used.flats, scan.evidence.used.darks)
+        for groups in (scan.evidence.used_references.flats, scan.evidence.used_references.darks)
     )
     if model.gain is not None:  # one count of a mean over n pixels stands for n times as many photons
-        n_photons = _counts_of_light(references) * binning**2 / model.gain
+        n_photons = _counts_in_flats(references) * binning**2 / model.gain
         low, high = _PHOTONS
         if not low <= n_photons <= high:
             raise ConfigError(
@@ -123,17 +123,17 @@ def photons_of(scan: SelectedScan, references: References) -> Photons | None:
             ) from error
     # one count of a mean over n frames also stands for n times as many photons; flats and darks are single frames
     photons = Photons(photons.gain / source.frames_per_view, photons.variance / source.frames_per_view)
-    if model.noise == "auto" and not light_of(references, photons) < FEW_PHOTONS:
+    if model.noise == "auto" and not photons_in_flats(references, photons) < FEW_PHOTONS:
         return None
     return photons
 
 
-def light_of(references: References, photons: Photons) -> float:
+def photons_in_flats(references: References, photons: Photons) -> float:
     """Photons per pixel in the open beam: the median of the flats over the pixels in the beam, see `lit_places`."""
-    return _counts_of_light(references) / photons.gain
+    return _counts_in_flats(references) / photons.gain
 
 
-def _counts_of_light(references: References) -> float:
+def _counts_in_flats(references: References) -> float:
     intensity = references.flats[0][1] - references.dark
     return float(np.median(intensity[exposed] if (exposed := lit_places(intensity)).any() else intensity))
 
@@ -142,7 +142,7 @@ def noise_sentence(references: References, photons: Photons | None) -> str:
     """A sentence that says how counts are converted to line integrals; empty if they are converted with logarithms."""
     if photons is None:
         return ""
-    n_photons, readout = light_of(references, photons), photons.variance**0.5
+    n_photons, readout = photons_in_flats(references, photons), photons.variance**0.5
     return (
         f"Photon statistics are used (--noise counts): {n_photons:.3g} photons per pixel in the open beam, "
         f"{photons.gain:.3g} counts per photon, readout noise {readout:.3g} counts"

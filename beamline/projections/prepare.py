@@ -76,7 +76,7 @@ def prepare_projections(
         scan: a finished scan.
         warn: function that gets a sentence about everything that is unusual but does not stop the work.
         buffer: receives the line integrals on disk; missing rays, and rays with weight 0 because of flags, are
-        interpolated, and `shares` is None. None: line integrals stay in memory.
+        interpolated, and `region_weights` is None. None: line integrals stay in memory.
         check: raises an error if the geometry of the projections is wrong, before they are corrected.
         phases: function that gets the name of each phase when the phase begins.
 
@@ -86,7 +86,7 @@ def prepare_projections(
     """
     phases = phases or Phases()
     phases.enter("flags and references")
-    usable, poses, wide = _usable(scan, warn)
+    usable, poses, offset_frames = _usable(scan, warn)
     phases.enter("tilt and references", "bands")
     scan, tilt = with_tilt(scan, usable.frames, warn, phases.progress)
     selection, plan = scan.selection, survey(scan, usable.frames)
@@ -100,11 +100,11 @@ def prepare_projections(
     phases.enter("jumps", "guesses")
     view_geometry = ViewGeometry(scan, axis_col)
     usable = view_geometry.find_motion(usable, warn, phases)
-    used, others = _chosen(view_geometry, usable, poses)
-    view_geometry.calibrate(np.union1d(used, others), phases)
+    used, held_out_frames = _chosen(view_geometry, usable, poses)
+    view_geometry.calibrate(np.union1d(used, held_out_frames), phases)
     check(view_geometry.of(used))
     phases.enter("correction")
-    used = np.union1d(used, wide) if buffer is None else used
+    used = np.union1d(used, offset_frames) if buffer is None else used
     projections = _corrected(plan, used, buffer, phases, warn)
     geometry = view_geometry.of(projections.view_ids)
     if estimated := _estimated(scan, projections, geometry):
@@ -113,20 +113,20 @@ def prepare_projections(
         if any(step.on(scan)[0] is not None for step in estimated):
             # anything unusual in the frames has already been reported
             projections = _corrected(plan, used, buffer, phases)
-    intensity_laws = compare_with_flats(scan, projections, warn)
+    air_residual = compare_with_flats(scan, projections, warn)
     phases.enter("background, rings, held-out projections, hardening", "corrections")
-    place = view_geometry.axis_col, axis
-    prepared = assemble(scan, projections, geometry, place, usable, warn, buffer is not None)
+    located_axis = view_geometry.axis_col, axis
+    prepared = assemble(scan, projections, geometry, located_axis, usable, warn, buffer is not None)
     del projections  # the line integrals may be copied next
-    if others.size:
+    if held_out_frames.size:
         with suppress(NoViewError):
-            held_out = apply(plan, others, warn=warn)
-            room = None if buffer is None else buffer.views
-            prepared = prepared.with_held_out(held_out, view_geometry.of(held_out.view_ids), room)
+            held_out = apply(plan, held_out_frames, warn=warn)
+            storage = None if buffer is None else buffer.views
+            prepared = prepared.with_held_out(held_out, view_geometry.of(held_out.view_ids), storage)
     prepared = prepared.stating(done={**plan.done, **tilt, **view_geometry.done})
     prepared = with_reach(scan, _after_scan_steps(scan, prepared, phases))  # the steps changed line integrals
     prepared = prepared.stating(
-        laws={**intensity_laws, **warn_of_inconsistency(prepared.centred, scan.selection, warn)}
+        consistency={**air_residual, **warn_of_inconsistency(prepared.centred, scan.selection, warn)}
     )
     return prepared if buffer is None else _with_unknown_filled(prepared)
 
@@ -151,14 +151,14 @@ def _usable(scan: SelectedScan, warn: Warn) -> tuple[UsableViews, ScanPoses | No
     source, selection = scan.source, scan.selection
     usable = checked_views(scan, warn)
     warn_of_units(scan, warn)
-    first = choose_views(scan, usable.frames)
+    chosen = choose_views(scan, usable.frames)
     for step in geometry_steps(selection):
-        step.refuse_few(first.size, usable.frames.size, source.shape[1] // selection.binning)
+        step.refuse_few(chosen.size, usable.frames.size, source.shape[1] // selection.binning)
     poses = poses_of(scan, usable.frames)
     if poses is not None:
-        require_stated(poses, source, usable.frames[first])
-        aside = np.abs((cols := poses.shifts[usable.frames, 0]) - np.nanmedian(cols)) > source.shape[1] / 2
-        return replace(usable, frames=usable.frames[~aside]), poses, usable.frames[aside]
+        require_stated(poses, source, usable.frames[chosen])
+        is_offset = np.abs((cols := poses.shifts[usable.frames, 0]) - np.nanmedian(cols)) > source.shape[1] / 2
+        return replace(usable, frames=usable.frames[~is_offset]), poses, usable.frames[is_offset]
     return usable, poses, source.table.offset_views
 
 
@@ -168,11 +168,11 @@ def _chosen(
     """Rows of the file of the projections that are used, and of some further projections that are held out."""
     scan, frames = view_geometry.scan, usable.frames
     chosen = choose_views(scan, frames, view_geometry.of(frames).period)
-    used, rest = frames[chosen], np.delete(frames, chosen)
+    used, not_chosen = frames[chosen], np.delete(frames, chosen)
     if poses is not None:
         require_stated(poses, scan.source, used)
-        rest = rest[poses.stated(rest)]
-    return used, spread(rest, HELD_OUT_VIEWS)
+        not_chosen = not_chosen[poses.stated(not_chosen)]
+    return used, spread(not_chosen, HELD_OUT_VIEWS)
 
 
 def _corrected(
@@ -216,9 +216,9 @@ def _with_unknown_filled(prepared: PreparedProjections) -> PreparedProjections:
         weights = np.ones(geometry.detector_shape, np.float32)
         if prepared.sources.measured is not None:
             weights *= prepared.sources.measured
-        if prepared.sources.shares_of is not None:
-            shares = prepared.sources.shares_of(slice(view, view + 1), slice(0, len(weights)))
-            weights *= 1 if shares is None else shares[0]
+        if prepared.sources.region_weights_of is not None:
+            in_regions = prepared.sources.region_weights_of(slice(view, view + 1), slice(0, len(weights)))
+            weights *= 1 if in_regions is None else in_regions[0]
         if rays is not None:
             weights *= rays[view]
         if not weights.all():
@@ -259,13 +259,13 @@ def assemble(
         )
     unknown, resampling = projections.masked, selection.step(TiltAndLens).of(scan)
     if resampling is not None:
-        unknown = unknown | resampling.unseen((height, width), rows.start)
+        unknown = unknown | resampling.outside_detector((height, width), rows.start)
     unknown = areas(unknown)
     regions = replace(usable.regions, resampling=resampling).and_unmeasured(projections.unmeasured, first, binning)
 
-    def shares_of(views: slice, part: slice) -> NDArray[np.float32] | None:
-        within = slice(rows.start + part.start * binning, rows.start + part.stop * binning)
-        return regions.weights(ids[views], within, binning, (part.stop - part.start, width))
+    def region_weights_of(views: slice, part: slice) -> NDArray[np.float32] | None:
+        detector_rows = slice(rows.start + part.start * binning, rows.start + part.stop * binning)
+        return regions.weights(ids[views], detector_rows, binning, (part.stop - part.start, width))
 
     prepared = PreparedProjections(
         lines=Views(projections.data, geometry, projections.weights, ids),
@@ -282,10 +282,10 @@ def assemble(
         sources=WeightSources(
             usable.weights_of(ids),
             ~unknown if unknown.any() else None,
-            None if on_disk else shares_of(slice(None), slice(0, height)),
-            shares_of if on_disk and regions.mark(ids) else None,
+            None if on_disk else region_weights_of(slice(None), slice(0, height)),
+            region_weights_of if on_disk and regions.mark(ids) else None,
         ),
-        stretch=_stretch(source, geometry, resampled=resampling is not None),
+        pixel_aspect=_pixel_aspect(source, geometry, resampled=resampling is not None),
     )
     prepared = with_reach(scan, prepared)
     report_defects(prepared, first, binning, warn)
@@ -298,12 +298,12 @@ def with_reach(scan: SelectedScan, prepared: PreparedProjections) -> PreparedPro
     it.
     """
     width = scan.selection.sample_width
-    views = replace(prepared.seen, weights=prepared.sources.shares, reach=None)
+    views = replace(prepared.seen, weights=prepared.sources.region_weights, reach=None)
     reach = reach_of(views) if width is None else whole_reach(views, width / 2)
     return replace(prepared, lines=replace(prepared.lines, reach=reach))
 
 
-def _stretch(source: ScanSource, geometry: Geometry, *, resampled: bool) -> float:
+def _pixel_aspect(source: ScanSource, geometry: Geometry, *, resampled: bool) -> float:
     """Height of a pixel divided by its width.
 
     Raises:

@@ -52,7 +52,7 @@ class ScanOrigin:
             these.
         flags: flags of all frames of the scan; None if the file has no flags.
         done: what each step did, by name, in the order of the steps.
-        laws: the residuals of the consistency conditions in words, by name.
+        consistency: the residuals of the consistency conditions in words, by name.
     """
 
     axis_col: float
@@ -63,7 +63,7 @@ class ScanOrigin:
     left_out: int = 0
     flags: FrameFlags | None = None
     done: Mapping[str, StepDone] = field(default_factory=dict)
-    laws: Mapping[str, str] = field(default_factory=dict)
+    consistency: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,36 +71,42 @@ class WeightSources:
     """What lowers the weights of rays, in addition to the noise of counted photons.
 
     Attributes:
-        of_views: float32 [view used], less than 1 for projections with a warning of the monitor; None: 1 for all.
+        view_weights: float32 [view used], less than 1 for projections with a warning of the monitor; None: 1 for all.
         measured: bool [row, col], pixels that were measured or could be interpolated well; None: all pixels.
-        shares: float32 [view used, row, col], weights of rays in the regions of flags; None: all weights are 1.
-        shares_of: function that computes `shares` of some projections and rows on request, if line integrals are on
-            disk; None: use `shares`.
+        region_weights: float32 [view used, row, col], weights of rays in the regions of flags; None: all weights are 1.
+        region_weights_of: function that computes `region_weights` of some projections and rows on request, if line
+            integrals are on disk; None: use `region_weights`.
     """
 
-    of_views: F32 | None = None
+    view_weights: F32 | None = None
     measured: Mask | None = None
-    shares: F32 | None = None
-    shares_of: Callable[[slice, slice], F32 | None] | None = None
+    region_weights: F32 | None = None
+    region_weights_of: Callable[[slice, slice], F32 | None] | None = None
 
     def views(self, views: I64) -> WeightSources:
         """Those of only these of the projections used."""
-        return replace(self, of_views=_cut(self.of_views, views), shares=_cut(self.shares, views))
+        return replace(
+            self, view_weights=_part_of(self.view_weights, views), region_weights=_part_of(self.region_weights, views)
+        )
 
     def rows(self, rows: slice) -> WeightSources:
-        """Those of only these detector rows, with the shares computed."""
+        """Those of only these detector rows, with the weights in regions computed."""
         part = (..., rows, slice(None))
-        shares = _cut(self.shares, part) if self.shares_of is None else self.shares_of(slice(None), rows)
-        return replace(self, measured=_cut(self.measured, part), shares=shares, shares_of=None)
+        weights = (
+            _part_of(self.region_weights, part)
+            if self.region_weights_of is None
+            else self.region_weights_of(slice(None), rows)
+        )
+        return replace(self, measured=_part_of(self.measured, part), region_weights=weights, region_weights_of=None)
 
     @property
     def without_warnings(self) -> WeightSources:
         """Those without the warnings of the monitor: missing rays have weight 0, all others weight 1."""
-        shares = None if self.shares is None else (self.shares > 0).astype(np.float32)
-        return replace(self, of_views=None, shares=shares, shares_of=None)
+        weights = None if self.region_weights is None else (self.region_weights > 0).astype(np.float32)
+        return replace(self, view_weights=None, region_weights=weights, region_weights_of=None)
 
 
-def _cut(array: NDArray[Any] | None, part: Any) -> Any:
+def _part_of(array: NDArray[Any] | None, part: Any) -> Any:
     return None if array is None else array[part]
 
 
@@ -117,8 +123,8 @@ class PreparedProjections:
         origin: where the projections come from.
         sources: what lowers the weights of rays.
         times: [view used] time of the exposure of each projection in s; None: the method does not need it.
-        stretch: height of a pixel divided by its width. `geometry` has square pixels; the distance between slices is
-            larger by this factor.
+        pixel_aspect: height of a pixel divided by its width. `geometry` has square pixels; the distance between slices
+            is larger by this factor.
     """
 
     lines: Views
@@ -126,7 +132,7 @@ class PreparedProjections:
     origin: ScanOrigin
     sources: WeightSources = WeightSources()
     times: NDArray[np.float64] | None = None
-    stretch: float = 1.0
+    pixel_aspect: float = 1.0
 
     def stating(self, **facts: Any) -> PreparedProjections:
         """The same projections with these facts about their origin."""
@@ -151,8 +157,8 @@ class PreparedProjections:
     @property
     def with_gaps(self) -> F32:
         """The line integrals used, with NaN for pixels without data."""
-        known = {each.name: getattr(self.corrected, each.name) for each in fields(Corrected)}
-        return Projections(self.seen.data, self.ids, **known).measured
+        fields_of_projections = {each.name: getattr(self.corrected, each.name) for each in fields(Corrected)}
+        return Projections(self.seen.data, self.ids, **fields_of_projections).measured
 
     @property
     def geometry(self) -> Geometry:
@@ -165,13 +171,13 @@ class PreparedProjections:
         """Number of the projections used."""
         return len(self.lines.data) - self.lines.held_out.size
 
-    def stretched(self, volume: Volume) -> Volume:
+    def with_true_heights(self, volume: Volume) -> Volume:
         """A volume of `geometry`, resampled to the true heights of its slices."""
-        if self.stretch == 1:
+        if self.pixel_aspect == 1:
             return volume
         grid, (z, y, x) = volume.grid, volume.grid.centre
-        high = replace(grid, centre=(z * self.stretch, y, x), slice_pitch=grid.spacing[0] * self.stretch)
-        return Volume(volume.data, high)
+        true_grid = replace(grid, centre=(z * self.pixel_aspect, y, x), slice_pitch=grid.spacing[0] * self.pixel_aspect)
+        return Volume(volume.data, true_grid)
 
     @property
     def box(self) -> Grid:
@@ -184,12 +190,12 @@ class PreparedProjections:
     def of_rows(self, rows: slice, geometry: Geometry) -> PreparedProjections:
         """The same projections restricted to the detector rows of `geometry`; line integrals are not copied."""
 
-        whole = self.lines
-        part = whole.geometry.rows(rows.start, rows.stop) if whole.held_out.size else geometry
-        weights = _cut(whole.weights, (..., rows, slice(None)))
+        lines = self.lines
+        geometry_of_rows = lines.geometry.rows(rows.start, rows.stop) if lines.held_out.size else geometry
+        weights = _part_of(lines.weights, (..., rows, slice(None)))
         return replace(
             self,
-            lines=replace(whole, data=whole.data[:, rows], geometry=part, weights=weights),
+            lines=replace(lines, data=lines.data[:, rows], geometry=geometry_of_rows, weights=weights),
             corrected=replace(self.corrected, masked=self.corrected.masked[rows]),
             sources=self.sources.rows(rows),
         )
@@ -199,29 +205,29 @@ class PreparedProjections:
         """The same projections without laterally offset ones, in which the sample is displaced by more than half a
         field of view.
         """
-        return self.wanted(self.geometry.is_centred)
+        return self.selecting(self.geometry.is_centred)
 
-    def wanted(self, views: NDArray[np.bool_]) -> PreparedProjections:
-        """The same data with only the projections that `wanted` selects, bool [view used]."""
-        return self if views.all() else self.of_views(np.flatnonzero(views))
+    def selecting(self, chosen: NDArray[np.bool_]) -> PreparedProjections:
+        """The same data with only the projections that `chosen` selects, bool [view used]."""
+        return self if chosen.all() else self.of_views(np.flatnonzero(chosen))
 
     def of_views(self, views: I64) -> PreparedProjections:
         """The same data with only these of the projections used, by number and in this order. Held-out projections are
         unchanged.
         """
-        return self._of(self.lines.using(views), views)
+        return self._with_lines(self.lines.using(views), views)
 
-    def _of(self, lines: Views, views: I64) -> PreparedProjections:
+    def _with_lines(self, lines: Views, views: I64) -> PreparedProjections:
         """These line integrals. The projections with the numbers `views` are used."""
 
         air = replace(self.corrected, air=self.corrected.air[views])
         return replace(
-            self, lines=lines, corrected=air, sources=self.sources.views(views), times=_cut(self.times, views)
+            self, lines=lines, corrected=air, sources=self.sources.views(views), times=_part_of(self.times, views)
         )
 
     def holding_out(self, held: I64) -> PreparedProjections:
         """The same data with the projections of these numbers (sorted) held out. All of them were used before."""
-        return self._of(self.lines.holding_out(held), np.setdiff1d(np.arange(self.n_used), held))
+        return self._with_lines(self.lines.holding_out(held), np.setdiff1d(np.arange(self.n_used), held))
 
     def with_held_out(self, others: Projections, geometry: Geometry, room: F32 | None = None) -> PreparedProjections:
         """The same projections, which are all used, followed by other projections that are held out.
@@ -231,17 +237,17 @@ class PreparedProjections:
             room: array that begins with the line integrals of these projections and has room for the others; None: a
                 new array is made.
         """
-        lines, n, more = self.lines, len(self.lines.data), len(others.data)
+        lines, n, n_others = self.lines, len(self.lines.data), len(others.data)
         if room is None:
             data = np.concatenate((lines.data, others.data))
         else:
-            data = room[: n + more]
+            data = room[: n + n_others]
             data[n:] = others.data
-        counted: Any = others.weights
-        weights = None if lines.weights is None else np.concatenate((lines.weights, counted))
-        ids, used = np.concatenate((self.ids, others.view_ids)), np.arange(n + more) < n
-        together = lines.geometry.followed_by(geometry)
-        return replace(self, lines=Views(data, together, weights, ids, used, lines.reach))
+        other_weights: Any = others.weights
+        weights = None if lines.weights is None else np.concatenate((lines.weights, other_weights))
+        ids, used = np.concatenate((self.ids, others.view_ids)), np.arange(n + n_others) < n
+        joined_geometry = lines.geometry.followed_by(geometry)
+        return replace(self, lines=Views(data, joined_geometry, weights, ids, used, lines.reach))
 
     @property
     def whole_views(self) -> I64:
@@ -257,14 +263,14 @@ class PreparedProjections:
         """
         ids, (height, width) = self.ids, self.geometry.detector_shape
         runs = self.corrected.unmeasured
-        known = np.ones((height, width), np.bool_) if self.sources.measured is None else self.sources.measured
+        measured = np.ones((height, width), np.bool_) if self.sources.measured is None else self.sources.measured
         # [row, col + 1], number of known pixels to the left of the column
-        before = np.pad(np.cumsum(known, axis=1), ((0, 0), (1, 0)))
+        measured_before = np.pad(np.cumsum(measured, axis=1), ((0, 0), (1, 0)))
         _, row, left, right = runs[np.isin(runs[:, 0], ids)].T  # runs of these projections
-        lengths = before[row, right] - before[row, left]  # a run ends at a masked area
-        unseen = np.bincount(row, lengths, height) >= before[:, -1] * ids.size
-        lost = unseen | self.corrected.masked.all(axis=1)
-        return np.flatnonzero(lost), np.flatnonzero(lost & ~unseen)
+        lengths = measured_before[row, right] - measured_before[row, left]  # a run ends at a masked area
+        unseen = np.bincount(row, lengths, height) >= measured_before[:, -1] * ids.size
+        without_data = unseen | self.corrected.masked.all(axis=1)
+        return np.flatnonzero(without_data), np.flatnonzero(without_data & ~unseen)
 
     @property
     def leaves_slices(self) -> bool:
@@ -272,8 +278,8 @@ class PreparedProjections:
         they are shifted along the axis or tilted.
         """
         geometry = self.geometry
-        moved = np.ptp(geometry.shifts[:, 1]) > 0
-        return not geometry.is_cone and (bool(moved) or not geometry.is_straight)
+        shifted = np.ptp(geometry.shifts[:, 1]) > 0
+        return not geometry.is_cone and (bool(shifted) or not geometry.is_straight)
 
     @property
     def without_warnings(self) -> PreparedProjections:
@@ -288,27 +294,27 @@ class PreparedProjections:
         """
         factors: list[NDArray[np.float32]] = []
         n, geometry, sources = self.n_used, self.geometry, self.sources
-        others = len(self.lines.data) - n
-        if sources.of_views is not None:
-            factors.append(_and_ones(sources.of_views, others)[:, None, None])
-        if (counted := self.lines.weights) is not None:
-            factors.append(counted / (used := counted[:n]).mean(where=used > 0))
+        n_held_out = len(self.lines.data) - n
+        if sources.view_weights is not None:
+            factors.append(_and_ones(sources.view_weights, n_held_out)[:, None, None])
+        if (photon_weights := self.lines.weights) is not None:
+            factors.append(photon_weights / (used := photon_weights[:n]).mean(where=used > 0))
         if sources.measured is not None:
             factors.append(sources.measured.astype(np.float32)[None])
         if self.leaves_slices:
             grid = Grid.matching(geometry)
             factors.append(seen_rays(self.lines.geometry, grid).astype(np.float32))
-        if sources.shares is not None:
-            factors.append(_and_ones(sources.shares, others))
+        if sources.region_weights is not None:
+            factors.append(_and_ones(sources.region_weights, n_held_out))
         if not factors:
             return None
-        shape = (n + others, *geometry.detector_shape)
+        shape = (n + n_held_out, *geometry.detector_shape)
         return RayWeights(tuple(np.broadcast_to(factor, shape) for factor in factors))
 
 
-def _and_ones(values: NDArray[np.float32], others: int) -> NDArray[np.float32]:
+def _and_ones(values: NDArray[np.float32], n_others: int) -> NDArray[np.float32]:
     """The values of the projections used, followed by ones for the other projections."""
-    return np.concatenate((values, np.ones((others, *values.shape[1:]), np.float32)))
+    return np.concatenate((values, np.ones((n_others, *values.shape[1:]), np.float32)))
 
 
 def hold_out(

@@ -182,19 +182,19 @@ class GeometryStep(PrepStep, Protocol):
     """A step that finds the geometry from the projections of a finished scan.
 
     Attributes:
-        asked_by: the option that asks for it.
+        requested_by: the option that asks for it.
         geometry: names of the terms that are to be estimated. With "roll", "tilt" or "shifts", a detector row may show
             several slices.
-        may_lean: True if the estimated projections may be rolled or tilted.
+        may_roll_or_tilt: True if the estimated projections may be rolled or tilted.
     """
 
-    asked_by: ClassVar[str]
+    requested_by: ClassVar[str]
 
     @property
     def geometry(self) -> frozenset[str]: ...
 
     @property
-    def may_lean(self) -> bool: ...
+    def may_roll_or_tilt(self) -> bool: ...
 
     def refuse_few(self, used: int, usable: int, cols: int) -> None:
         """Raise DataError if a term needs more projections (used or usable), or more binned columns, than there are."""

@@ -44,13 +44,13 @@ def read_binned(
     memory, a few rows of all frames are read at a time; otherwise all rows of a few frames.
     """
     height, width = (rows.stop - rows.start) // binning, source.shape[1] // binning
-    whole = binning == 1 and source.dtype.kind in "ui"
-    out = np.empty((len(frames), height, width), source.dtype.newbyteorder("=") if whole else np.float32)
-    row_bytes, by_rows = source.shape[1] * source.dtype.itemsize, _held_by_rows(source)
+    keeps_integers = binning == 1 and source.dtype.kind in "ui"
+    out = np.empty((len(frames), height, width), source.dtype.newbyteorder("=") if keeps_integers else np.float32)
+    row_bytes, by_rows = source.shape[1] * source.dtype.itemsize, _read_by_rows(source)
     batch = len(frames) if by_rows else max(1, BATCH_BYTES // max(1, (rows.stop - rows.start) * row_bytes))
-    high = max(1, BATCH_BYTES // max(1, batch * row_bytes * binning)) if by_rows else max(1, height)
-    for top, start in product(range(0, height, high), range(0, len(frames), max(1, batch))):
-        end = min(top + high, height)
+    n_rows = max(1, BATCH_BYTES // max(1, batch * row_bytes * binning)) if by_rows else max(1, height)
+    for top, start in product(range(0, height, n_rows), range(0, len(frames), max(1, batch))):
+        end = min(top + n_rows, height)
         raw = read_known(source, frames[start : start + batch], slice(*(rows.start + n * binning for n in (top, end))))
         if binning > 1:
             raw = _mean_bins(raw[..., : width * binning].astype(np.float32), binning)
@@ -59,7 +59,7 @@ def read_binned(
     return out
 
 
-def _held_by_rows(source: ScanSource) -> bool:
+def _read_by_rows(source: ScanSource) -> bool:
     """True if a frame shares its chunks in the file with other frames, and there are more chunks than are kept in
     memory.
     """
@@ -78,9 +78,9 @@ def reading_memory(source: ScanSource, frames: int, rows: slice, binning: int) -
     return 4 * frames * pixels // binning**2 + at_once * (itemsize + 4 + 2) + of_file
 
 
-def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:
-    k, rows, cols = raw.shape
-    blocks = raw.reshape(k, rows // n, n, cols // n, n)
+def _mean_bins(raw: NDArray[np.float32], binning: int) -> NDArray[np.float32]:
+    n_frames, rows, cols = raw.shape
+    blocks = raw.reshape(n_frames, rows // binning, binning, cols // binning, binning)
     finite = np.isfinite(blocks)
     if finite.all():
         return blocks.mean(axis=(2, 4), dtype=np.float32)
@@ -94,15 +94,15 @@ def damaged_frames(scan: SelectedScan, frames: NDArray[np.int64]) -> tuple[NDArr
     also frames that differ from their checksum, unless the selection uses all frames.
     """
     source = scan.source
-    lost, sentences = np.isin(frames, sorted(source.unreadable)), list[str]()
-    if lost.any():
-        first = int(frames[lost].min())
-        how_many = count(int(lost.sum()), "frame")
-        reason = source.unreadable[first]
-        are = "is" if lost.sum() == 1 else "are"
-        lost_frames = spans(np.sort(frames[lost]).tolist())
+    unreadable, sentences = np.isin(frames, sorted(source.unreadable)), list[str]()
+    if unreadable.any():
+        first_frame = int(frames[unreadable].min())
+        how_many = count(int(unreadable.sum()), "frame")
+        reason = source.unreadable[first_frame]
+        are = "is" if unreadable.sum() == 1 else "are"
+        lost_frames = spans(np.sort(frames[unreadable]).tolist())
         sentences.append(f"{how_many} cannot be read and {are} left out: {lost_frames}. {reason}")
-    damaged = np.isin(frames, sorted(source.damaged)) & ~lost
+    damaged = np.isin(frames, sorted(source.damaged)) & ~unreadable
     used = scan.selection.step(Preparation).uses_flags
     if damaged.any():
         taken = "left out" if used else "used anyway (--flags ignore)"
@@ -111,7 +111,7 @@ def damaged_frames(scan: SelectedScan, frames: NDArray[np.int64]) -> tuple[NDArr
         sentences.append(
             f"Look for an intact copy of {source.path}: {which} {differ} from the stored checksum, {taken}."
         )
-    return lost | damaged if used else lost, sentences
+    return unreadable | damaged if used else unreadable, sentences
 
 
 def spoilt_frames(source: ScanSource, use_damaged: bool) -> list[int]:
@@ -200,33 +200,33 @@ def read_views(
     Args:
         references: darks and flats of the rows that `filters` read, binned; None: the frames are line integrals.
         warn: function that gets sentences about frames that are copies, and about frames that are left out, except if
-            they have no beam (see `unlit_sentence`).
+            they have no beam (see `no_beam_sentence`).
     """
-    scan, source = filters.scan.evidence, filters.scan.source
+    evidence, source = filters.scan.evidence, filters.scan.source
     data = read_binned(source, frames, filters.read(rows), filters.scan.selection.binning, progress)
-    lost, reported = damaged_frames(filters.scan, frames)
-    data, frames = (data[~lost], frames[~lost]) if lost.any() else (data, frames)
-    alive = np.isfinite(data).any(axis=(1, 2))
-    if not alive.all():
-        dark = frames[~alive]
+    left_out, reported = damaged_frames(filters.scan, frames)
+    data, frames = (data[~left_out], frames[~left_out]) if left_out.any() else (data, frames)
+    has_finite_pixel = np.isfinite(data).any(axis=(1, 2))
+    if not has_finite_pixel.all():
+        without_pixels = frames[~has_finite_pixel]
         if rows is None:  # a band of rows is not enough to decide whether a projection is usable
-            first_frame = dark[0]
-            have = "has" if dark.size == 1 else "have"
-            are = "is" if dark.size == 1 else "are"
+            first_frame = without_pixels[0]
+            have = "has" if without_pixels.size == 1 else "have"
+            are = "is" if without_pixels.size == 1 else "are"
             reported.append(
-                f"{dark.size} of {source.table.views.size} projections {have} no finite pixel and {are} left out "
-                f"(first: frame {first_frame})."
+                f"{without_pixels.size} of {source.table.views.size} projections {have} no finite pixel and {are} left "
+                f"out (first: frame {first_frame})."
             )
-        data, frames = data[alive], frames[alive]
+        data, frames = data[has_finite_pixel], frames[has_finite_pixel]
     exposed, part = np.ones(len(frames), np.bool_), filters.within(rows)
     beam = None if references is None else (references.dark[part], references.flats[0][1][part])
-    for view in np.flatnonzero(scan.light.suspect(data, beam)):
-        exposed[view] = not scan.light.unlit(int(frames[view]))
+    for view in np.flatnonzero(evidence.illumination.suspect(data, beam)):
+        exposed[view] = not evidence.illumination.without_beam(int(frames[view]))
     if not exposed.all():
         data, frames = data[exposed], frames[exposed]
     if warn is not None:
         if rows is None and references is not None:
-            reported += _copies(scan, data, frames)
+            reported += _copies(evidence, data, frames)
         for sentence in reported:
             warn(sentence)
     return data, frames
@@ -251,19 +251,21 @@ def _copies(scan: ScanEvidence, data: NDArray[Any], frames: NDArray[np.int64]) -
     ]
 
 
-def unlit_sentence(scan: ScanEvidence, requested: NDArray[np.int64], exposed: NDArray[np.int64]) -> str:
+def no_beam_sentence(scan: ScanEvidence, requested: NDArray[np.int64], exposed: NDArray[np.int64]) -> str:
     """A sentence about requested projections without beam, and the gap in angle that they leave; empty if all
     projections have beam.
     """
-    unlit = np.intersect1d(np.setdiff1d(requested, exposed), np.array(scan.light.known_unlit, np.int64))
-    if not unlit.size:
+    without_beam = np.intersect1d(
+        np.setdiff1d(requested, exposed), np.array(scan.illumination.known_without_beam, np.int64)
+    )
+    if not without_beam.size:
         return ""
     gap = f", and{gap_text}" if (gap_text := gap_sentence(scan.source, requested, exposed)) else ""
-    they_are = "It is" if unlit.size == 1 else "They are"
+    they_are = "It is" if without_beam.size == 1 else "They are"
     return (
-        f"{count(unlit.size, 'projection')} of {scan.source.table.views.size} ({frames_text(unlit)}) had no beam: "
-        f"the shutter was closed, the beam was lost, or these frames were never written to the file. {they_are} left "
-        f"out{gap}."
+        f"{count(without_beam.size, 'projection')} of {scan.source.table.views.size} ({frames_text(without_beam)}) had "
+        "no beam: the shutter was closed, the beam was lost, or these frames were never written to the file. "
+        f"{they_are} left out{gap}."
     )
 
 
@@ -272,7 +274,7 @@ def no_view(scan: ScanEvidence, references: References | None) -> NoViewError:
     beside_flats = (
         ""
         if references is None
-        else f" The brightest projections have {scan.light.brightest:.2g} of the intensity of the flats. If the "
+        else f" The brightest projections have {scan.illumination.brightest:.2g} of the intensity of the flats. If the "
         "projections were already divided by their flats, give --quantity transmission or "
         "line-integrals."
     )

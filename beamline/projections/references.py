@@ -30,7 +30,7 @@ class _Reading:
     """Reads (binned) pixels of darks and flats, and finds the zingers in them.
 
     Attributes:
-        light: counts in the open beam.
+        open_beam_counts: counts in the open beam.
         spots: number of pixels in zingers, by frame.
     """
 
@@ -38,31 +38,31 @@ class _Reading:
     rows: slice
     binning: int
     use_damaged: bool
-    light: float
+    open_beam_counts: float
     spots: dict[int, int] = field(default_factory=dict)
 
     @classmethod
     def of(cls, scan: SelectedScan, rows: slice) -> _Reading:
         binning = scan.selection.binning
-        flat = read_binned(scan.source, scan.evidence.used.flats[0][:1], rows, binning)
-        light = float(np.percentile(np.nan_to_num(flat), BRIGHT))
-        return cls(scan.evidence, rows, binning, not scan.selection.step(Preparation).uses_flags, light)
+        flat = read_binned(scan.source, scan.evidence.used_references.flats[0][:1], rows, binning)
+        open_beam_counts = float(np.percentile(np.nan_to_num(flat), BRIGHT))
+        return cls(scan.evidence, rows, binning, not scan.selection.step(Preparation).uses_flags, open_beam_counts)
 
     def images(self, frames: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[Any]]]:
         """Yields the usable frames [row, col], without zingers."""
-        used = list[int]()
+        usable_frames = list[int]()
 
         def good() -> Iterator[NDArray[Any]]:
             for frame in frames.tolist():
                 image = read_binned(self.evidence.source, np.array([frame]), self.rows, self.binning)[0]
                 if frame not in spoilt_frames(self.evidence.source, self.use_damaged):
-                    used.append(frame)
+                    usable_frames.append(frame)
                     yield image
 
-        for number, (image, n) in enumerate(without_spots(good(), self.light)):
+        for number, (image, n) in enumerate(without_spots(good(), self.open_beam_counts)):
             if n:
-                self.spots[used[number]] = n
-            yield used[number], image
+                self.spots[usable_frames[number]] = n
+            yield usable_frames[number], image
 
     def mean(self, frames: NDArray[np.int64], weights: NDArray[np.float64] | None = None) -> NDArray[np.float64] | None:
         """Mean of the usable frames, each multiplied by its weight [frame of the scan]. None if no frame is usable."""
@@ -94,16 +94,23 @@ def read_references(scan: SelectedScan, rows: slice) -> tuple[References, str]:
         DataError: all frames of a kind are damaged.
     """
     reading, evidence = _Reading.of(scan, rows), scan.evidence
-    darks = reading.darks(np.concatenate(evidence.used.darks))
+    darks = reading.darks(np.concatenate(evidence.used_references.darks))
     dark = _dark_of(evidence.usual_exposure, darks)
-    scale = light_scale(evidence, scan.selection.step(Preparation).by_current)
+    factors = intensity_factors_of(evidence, scan.selection.step(Preparation).by_current)
     flats = []
-    for group in evidence.used.flats:
-        mean = reading.mean(group, scale)
+    for group in evidence.used_references.flats:
+        mean = reading.mean(group, factors)
         if dark is not None and mean is not None:
             used = np.setdiff1d(group, spoilt_frames(scan.source, reading.use_damaged))
-            own, mean_scale = _dark_of(float(np.median(scan.table.exposures[used])), darks), scale[used].mean()
-            net = (1 - mean_scale) * dark if own is dark or own is None else dark - mean_scale * own
+            flats_dark, mean_factor = (
+                _dark_of(float(np.median(scan.table.exposures[used])), darks),
+                factors[used].mean(),
+            )
+            net = (
+                (1 - mean_factor) * dark
+                if flats_dark is dark or flats_dark is None
+                else dark - mean_factor * flats_dark
+            )
             flats.append((float(used.mean()), (mean + net).astype(np.float32)))
     if dark is None or not flats:
         frames_kind = "darks" if dark is None else "flats"
@@ -134,16 +141,16 @@ def with_dynamic_flats(scan: SelectedScan, references: References, rows: slice) 
         ConfigError: there are too few flats.
     """
 
-    preparation, used = scan.selection.step(Preparation), scan.evidence.used
-    frames = np.setdiff1d(np.concatenate(used.flats), spoilt_frames(scan.source, not preparation.uses_flags))
-    scale = light_scale(scan.evidence, preparation.by_current)
+    preparation, groups = scan.selection.step(Preparation), scan.evidence.used_references
+    frames = np.setdiff1d(np.concatenate(groups.flats), spoilt_frames(scan.source, not preparation.uses_flags))
+    factors = intensity_factors_of(scan.evidence, preparation.by_current)
     reading = _Reading.of(scan, rows)
-    darks = reading.darks(np.concatenate(used.darks))
+    darks = reading.darks(np.concatenate(groups.darks))
 
     def flats() -> Iterator[NDArray[np.float32]]:
         for frame, image in reading.images(frames):
             dark = references.dark if len(darks) < 2 else _dark_of(float(scan.table.exposures[frame]), darks)
-            yield ((image - dark) * np.float32(scale[frame])).astype(np.float32)
+            yield ((image - dark) * np.float32(factors[frame])).astype(np.float32)
 
     masked = dead_pixels(references.dark, [flat for _, flat in references.flats], preparation.hot_threshold)
     try:
@@ -153,43 +160,43 @@ def with_dynamic_flats(scan: SelectedScan, references: References, rows: slice) 
     return replace(references, dynamic=dynamic)
 
 
-def light_scale(scan: ScanEvidence, by_current: bool = False) -> NDArray[np.float64]:
+def intensity_factors_of(scan: ScanEvidence, by_current: bool = False) -> NDArray[np.float64]:
     """[frame] factor that scales each frame from its exposure to the median exposure of the projections; 1 if an
     exposure is unknown. With `by_current`, the ring current is scaled, too.
     """
 
-    scale = _to_median(scan.exposures, scan.table.views)
-    return scale * current_scale(scan) if by_current else scale
+    factors = _factors_to_median(scan.exposures, scan.table.views)
+    return factors * current_factors(scan) if by_current else factors
 
 
-def _to_median(values: NDArray[np.float64], views: NDArray[np.int64]) -> NDArray[np.float64]:
+def _factors_to_median(values: NDArray[np.float64], views: NDArray[np.int64]) -> NDArray[np.float64]:
     """The median value of the projections divided by the value of each frame; 1 if a value is unknown."""
     known = values[views][np.isfinite(values[views])]
     return np.where(np.isfinite(values), np.median(known) / values, 1.0) if known.size else np.ones(values.size)
 
 
-def current_scale(scan: ScanEvidence) -> NDArray[np.float64]:
+def current_factors(scan: ScanEvidence) -> NDArray[np.float64]:
     """[frame] factor that scales each frame from its ring current to the median ring current of the projections.
 
     Raises:
         ConfigError: the file has no ring current for a projection or a flat.
     """
-    used = scan.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)
+    rows = scan.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)
     currents = scan.table.currents
-    if currents is None or not np.isfinite(currents[used]).all():
+    if currents is None or not np.isfinite(currents[rows]).all():
         lacking = "no ring current" if currents is None else "projections or flats without a ring current"
         raise ConfigError(f"Omit --ring-current use: {scan.source.path} has {lacking} (control/data of NXtomo).")
-    return _to_median(currents, scan.table.views)
+    return _factors_to_median(currents, scan.table.views)
 
 
 def uncorrected_current(scan: SelectedScan) -> str:
     """The warning that the ring current changed between flats and projections and is not corrected; "" if it did not
     change.
     """
-    known = scan.table.currents
-    if not scan.evidence.in_counts or scan.selection.step(Preparation).by_current or known is None:
+    all_currents = scan.table.currents
+    if not scan.evidence.in_counts or scan.selection.step(Preparation).by_current or all_currents is None:
         return ""
-    currents = known[scan.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)]
+    currents = all_currents[scan.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)]
     if not currents.size or not (currents > 0).all() or currents.max() < (1 + _STEADY) * currents.min():
         return ""
     variation = currents.max() / currents.min() - 1
@@ -213,7 +220,7 @@ def flats_sentence(scan: ScanEvidence, references: References, by_current: bool)
             "was scaled to its exposure time."
         )
     if by_current:
-        currents = 1 / current_scale(scan)[scan.table.views]
+        currents = 1 / current_factors(scan)[scan.table.views]
         sentences.append(
             f"The ring current of the projections varies from {currents.min():.3f} to {currents.max():.3f} times its "
             "median; each projection was scaled to its ring current."

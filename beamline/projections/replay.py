@@ -29,16 +29,16 @@ class SkippedChecks:
 
     Attributes:
         views: number of exposed projections.
-        alone: number of projections that were not compared with earlier projections.
-        without_flats, cones, wider: numbers of projections for which checks were skipped because the scan has no flats,
-            because the beam is a cone, or because the sample is wider than the field of view.
+        without_earlier: number of projections that were not compared with earlier projections.
+        without_flats, in_cone, wider_than_field: numbers of projections for which checks were skipped because the scan
+            has no flats, because the beam is a cone, or because the sample is wider than the field of view.
     """
 
     views: int = 0
-    alone: int = 0
+    without_earlier: int = 0
     without_flats: int = 0
-    cones: int = 0
-    wider: int = 0
+    in_cone: int = 0
+    wider_than_field: int = 0
 
     def with_frame(self, context: ScanContext) -> SkippedChecks:
         """The counts after the next frame. `context` contains what the checks knew about this frame."""
@@ -46,22 +46,26 @@ class SkippedChecks:
             return self
         return SkippedChecks(
             self.views + 1,
-            self.alone + (context.change is None),
+            self.without_earlier + (context.change is None),
             self.without_flats + (not context.grid.flats),
-            self.cones + context.cone,
-            self.wider + (context.truncated and context.grid.flats),
+            self.in_cone + context.cone,
+            self.wider_than_field + (context.truncated and context.grid.flats),
         )
 
     def in_words(self) -> tuple[str, ...]:
         """The skipped checks, each as a text with the number of projections and the reason. The first projections have
         no predecessors; they are mentioned only if this is true for all projections.
         """
-        alone = self.alone if self.alone > min(SPAN, self.views - 1) else 0
+        without_earlier = self.without_earlier if self.without_earlier > min(SPAN, self.views - 1) else 0
         reasons = (
             ("drift of beam, field, opposite, mass", self.without_flats, "no flats"),
-            ("gain, motion, floater, ghost, dips of beam", alone, "no four earlier projections at even angular steps"),
-            ("opposite", self.cones, "cone beam"),
-            ("mass", self.wider, "sample wider than the field of view"),
+            (
+                "gain, motion, floater, ghost, dips of beam",
+                without_earlier,
+                "no four earlier projections at even angular steps",
+            ),
+            ("opposite", self.in_cone, "cone beam"),
+            ("mass", self.wider_than_field, "sample wider than the field of view"),
         )
         return tuple(f"{checks} in {n} of {self.views} projections ({why})" for checks, n, why in reasons if n)
 
@@ -74,21 +78,21 @@ class FrameVerdict:
         row: row of the frame in the file.
         kind: kind of the frame.
         flags: flags of the checks.
-        n: number of frames in the file so far.
-        aside: number of projections for which each check was skipped so far.
+        n_frames: number of frames in the file so far.
+        skipped: number of projections for which each check was skipped so far.
         failures: a sentence for each check that failed with an error at this frame. The check is not used from then on.
     """
 
     row: int
     kind: FrameKind
     flags: tuple[Flag, ...]
-    n: int
-    aside: SkippedChecks
+    n_frames: int
+    skipped: SkippedChecks
     failures: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
-class Kind:
+class FlagKind:
     """All flags of a check at one level.
 
     Attributes:
@@ -117,7 +121,7 @@ class ScanVerdict:
     """
 
     n_frames: int
-    kinds: tuple[Kind, ...]
+    kinds: tuple[FlagKind, ...]
     alarmed: tuple[int, ...]
     retaken: tuple[int, ...]
     references: tuple[str, ...]
@@ -154,32 +158,34 @@ def replay(
     Raises:
         DataError: the file stopped growing before it was finished (only with `follow`).
     """
-    monitor, aside = start(context_of(source), checks), SkippedChecks()
+    monitor, skipped = start(context_of(source), checks), SkippedChecks()
     for frame, n in frames_of(source, follow=follow, should_stop=should_stop):
         frame_digest = digest(frame.counts, monitor.context.saturation, check_block(source.shape))
         monitor, flags, failures = look_past_failures(monitor, frame, frame_digest)
-        aside = aside.with_frame(monitor.context)
-        yield FrameVerdict(frame.index, frame.kind, flags, n, aside, failures)
+        skipped = skipped.with_frame(monitor.context)
+        yield FrameVerdict(frame.index, frame.kind, flags, n, skipped, failures)
 
 
-def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: ReferenceLimits | None = None) -> ScanVerdict:
+def verdict(
+    source: ScanSource, frame_verdicts: Sequence[FrameVerdict], limits: ReferenceLimits | None = None
+) -> ScanVerdict:
     """The verdict about the frames, together with the faults of darks, flats and the file.
 
     Args:
         limits: limits for darks and flats; None: the default limits.
     """
-    flags = [flag for each in judged for flag in each.flags]
-    again = frozenset(source.table.replaced.tolist())
+    flags = [flag for frame_verdict in frame_verdicts for flag in frame_verdict.flags]
+    retaken = frozenset(source.table.replaced.tolist())
     findings = ScanEvidence(source, EvidenceRequest(limits=limits)).findings
-    failures = tuple(failure for each in judged for failure in each.failures)
+    failures = tuple(failure for frame_verdict in frame_verdicts for failure in frame_verdict.failures)
     return ScanVerdict(
-        n_frames=len(judged),
+        n_frames=len(frame_verdicts),
         kinds=by_kind(flags),
-        alarmed=tuple(sorted({n for flag in flags if flag.level is Level.ALARM for n in flag.frames} - again)),
-        retaken=tuple(sorted(again)),
+        alarmed=tuple(sorted({n for flag in flags if flag.level is Level.ALARM for n in flag.frames} - retaken)),
+        retaken=tuple(sorted(retaken)),
         references=tuple(finding.message for finding in findings if finding.frames),
         altered=altered_sentence(source) if source.table.altered.any() else "",
-        aside=failures + (judged[-1].aside.in_words() if judged else ()),
+        aside=failures + (frame_verdicts[-1].skipped.in_words() if frame_verdicts else ()),
     )
 
 
@@ -188,20 +194,20 @@ def judged_flags(source: ScanSource) -> FrameFlags:
     return FrameFlags.of_flags([judged.flags for judged in replay(source)])
 
 
-def by_kind(flags: Iterable[Flag]) -> tuple[Kind, ...]:
+def by_kind(flags: Iterable[Flag]) -> tuple[FlagKind, ...]:
     """Flags by check and level, the worst level first, then by descending number of frames."""
     grouped: dict[tuple[str, Level], list[Flag]] = {}
     for flag in flags:
         grouped.setdefault((flag.check, flag.level), []).append(flag)
     kinds = [
-        Kind(*key, tuple(sorted(frames)), max(grouped[key], key=_excess))
+        FlagKind(*key, tuple(sorted(frames)), max(grouped[key], key=_excess))
         for key, frames in flagged_frames(chain.from_iterable(grouped.values())).items()
     ]
     levels = (Level.ALARM, Level.WARN, Level.INFO)
     return tuple(sorted(kinds, key=lambda kind: (levels.index(kind.level), -len(kind.frames))))
 
 
-def counts_of(kinds: Iterable[Kind]) -> Mapping[str, Mapping[str, int]]:
+def counts_of(kinds: Iterable[FlagKind]) -> Mapping[str, Mapping[str, int]]:
     """Number of frames by check, then by level."""
     counts: dict[str, dict[str, int]] = {}
     for kind in kinds:

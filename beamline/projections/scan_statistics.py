@@ -26,18 +26,18 @@ class KindStatistics:
     """Statistics of the pixel values of one kind of frame.
 
     Attributes:
-        frames: number of frames that were examined, out of `of` frames.
+        frames: number of frames that were examined, out of `n_all` frames.
         minimum, maximum, mean, deviation: statistics of all finite pixels of these frames.
         percentiles: percentiles at PERCENT, exact to one count; for real numbers, to 1/65536 of their range.
         saturated: fraction of the pixels that have the largest value of their type; 0 for real numbers.
         not_finite: fraction of the pixels that are not finite.
         absolute: sum of the absolute pixel values of a frame, mean over the frames.
-        edges, pixels: the histogram.
+        bin_edges, bin_counts: the histogram.
     """
 
     kind: FrameKind
     frames: int
-    of: int
+    n_all: int
     minimum: float
     maximum: float
     mean: float
@@ -45,8 +45,8 @@ class KindStatistics:
     percentiles: tuple[float, ...]
     saturated: float
     not_finite: float
-    edges: NDArray[np.float64]
-    pixels: NDArray[np.int64]
+    bin_edges: NDArray[np.float64]
+    bin_counts: NDArray[np.int64]
     absolute: float = 0.0
 
 
@@ -79,17 +79,28 @@ def _of_kind(
     """Statistics from two passes over the frames. The first pass finds the range; the second makes the histogram, and
     moments about a value in the range.
     """
-    low, high, finite, whole = np.inf, -np.inf, 0, 0
+    low, high, n_finite, n_pixels = np.inf, -np.inf, 0, 0
     for row in map(int, rows):
         values = image(row)
-        good = values[np.isfinite(values)]
-        finite, whole = finite + good.size, whole + values.size
-        if good.size:
-            low, high = min(low, float(good.min())), max(high, float(good.max()))
-    if not finite:
-        none = (np.nan,) * len(PERCENT)
+        finite_values = values[np.isfinite(values)]
+        n_finite, n_pixels = n_finite + finite_values.size, n_pixels + values.size
+        if finite_values.size:
+            low, high = min(low, float(finite_values.min())), max(high, float(finite_values.max()))
+    if not n_finite:
+        unknown = (np.nan,) * len(PERCENT)
         return KindStatistics(
-            kind, rows.size, n_all, np.nan, np.nan, np.nan, np.nan, none, 0.0, 1.0, np.zeros(2), np.zeros(1, np.int64)
+            kind,
+            rows.size,
+            n_all,
+            np.nan,
+            np.nan,
+            np.nan,
+            np.nan,
+            unknown,
+            0.0,
+            1.0,
+            np.zeros(2),
+            np.zeros(1, np.int64),
         )
     whole_numbers = dtype.kind in "iu" and high - low < 2**20
     edges = (
@@ -97,29 +108,29 @@ def _of_kind(
     )
     pixels, total, squares, absolute = np.zeros(edges.size - 1, np.int64), 0.0, 0.0, 0.0
     for row in map(int, rows):
-        good = image(row)
-        good = good[np.isfinite(good)]
-        away = good.astype(np.float64) - low
+        finite_values = image(row)
+        finite_values = finite_values[np.isfinite(finite_values)]
+        above_low = finite_values.astype(np.float64) - low
         if whole_numbers:
-            pixels += np.bincount(away.astype(np.int64), minlength=pixels.size)
+            pixels += np.bincount(above_low.astype(np.int64), minlength=pixels.size)
         else:
-            pixels += np.histogram(good, edges)[0]
-        total, squares = total + float(away.sum()), squares + float(away @ away)
-        absolute += float(np.abs(away + low).sum()) / rows.size
-    mean = total / finite
-    below = np.cumsum(pixels)
-    bins = np.searchsorted(below, np.array(PERCENT) / 100 * finite)
+            pixels += np.histogram(finite_values, edges)[0]
+        total, squares = total + float(above_low.sum()), squares + float(above_low @ above_low)
+        absolute += float(np.abs(above_low + low).sum()) / rows.size
+    mean = total / n_finite
+    cumulative = np.cumsum(pixels)
+    bins = np.searchsorted(cumulative, np.array(PERCENT) / 100 * n_finite)
     middles = (edges[1:] + edges[:-1]) / 2
-    full = float(np.iinfo(dtype).max) if dtype.kind in "iu" else np.inf
+    full_scale = float(np.iinfo(dtype).max) if dtype.kind in "iu" else np.inf
     return KindStatistics(
-        kind, rows.size, n_all, low, high, low + mean, float(np.sqrt(max(squares / finite - mean**2, 0.0))),
-        tuple(float(middles[i]) for i in bins), float(pixels[-1] / finite) if high == full else 0.0, 1 - finite / whole,
-        edges, pixels, absolute,
+        kind, rows.size, n_all, low, high, low + mean, float(np.sqrt(max(squares / n_finite - mean**2, 0.0))),
+        tuple(float(middles[i]) for i in bins), float(pixels[-1] / n_finite) if high == full_scale else 0.0,
+        1 - n_finite / n_pixels, edges, pixels, absolute,
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class LightAsked:
+class DoseRequest:
     """What the user states for the intensity and the dose: photons per count, and a material.
 
     Attributes:
@@ -146,7 +157,7 @@ class LightAsked:
 
 def _gray(material: str, source: ScanSource, photons: float) -> float:
     """Dose at the surface in Gy for this many photons per pixel. Raises ConfigError as
-    `LightAsked.refuse_impossible`.
+    `DoseRequest.refuse_impossible`.
     """
     if source.cone is not None:
         raise ConfigError(
@@ -163,7 +174,7 @@ def _gray(material: str, source: ScanSource, photons: float) -> float:
 
 
 @dataclass(frozen=True)
-class Light:
+class PhotonDose:
     """Photons and dose of one projection of a scan.
 
     Attributes:
@@ -188,24 +199,24 @@ class Light:
         return out
 
 
-def light_of(source: ScanSource, statistics: list[KindStatistics], request: LightAsked) -> Light:
+def photon_dose_of(source: ScanSource, statistics: list[KindStatistics], request: DoseRequest) -> PhotonDose:
     """Intensity and dose of a projection, from the statistics of flats and darks.
 
     Raises:
-        ConfigError: as `LightAsked.refuse_impossible`.
+        ConfigError: as `DoseRequest.refuse_impossible`.
     """
     request.refuse_impossible(source)
     mean = {each.kind: each.mean for each in statistics}
     photons = (mean[FrameKind.FLAT] - mean[FrameKind.DARK]) * request.photons_per_count
-    seconds = (source.table.exposures[source.table.of_kind(kind)] for kind in (FrameKind.PROJECTION, FrameKind.FLAT))
-    known = [each[np.isfinite(each)] for each in seconds]
-    if all(each.size for each in known):  # otherwise all frames are assumed to have the same exposure
-        photons *= float(known[0].mean() / known[1].mean())
+    exposures = (source.table.exposures[source.table.of_kind(kind)] for kind in (FrameKind.PROJECTION, FrameKind.FLAT))
+    known_exposures = [each[np.isfinite(each)] for each in exposures]
+    if all(each.size for each in known_exposures):  # otherwise all frames are assumed to have the same exposure
+        photons *= float(known_exposures[0].mean() / known_exposures[1].mean())
     photons *= source.frames_per_view
     views = source.table.views.size
     if request.material is None:
-        return Light(views, photons)
-    return Light(
+        return PhotonDose(views, photons)
+    return PhotonDose(
         views, photons, _gray(request.material, source, photons), f"{request.material} at {source.energy_kev:g} keV"
     )
 
@@ -216,7 +227,7 @@ def table(statistics: list[KindStatistics]) -> list[tuple[str, ...]]:
     head = ("kind", "frames", "min", *percent, "max", "mean", "std", "sum |v|", "saturated", "no data")
     rows = [
         (
-            each.kind.name.lower(), f"{each.frames} of {each.of}",
+            each.kind.name.lower(), f"{each.frames} of {each.n_all}",
             *(f"{v:.6g}" for v in (each.minimum, *each.percentiles, each.maximum, each.mean, each.deviation)),
             f"{each.absolute:.6g}", f"{100 * each.saturated:.2g} %", f"{100 * each.not_finite:.3g} %",
         )
@@ -229,11 +240,11 @@ def histograms(statistics: list[KindStatistics]) -> bytes:
     """Histograms of the pixel values, one curve for each kind, as PNG; at most 400 bins each."""
     figure, axes = one_panel(4.2)
     for each in statistics:
-        step = max(1, -(-each.pixels.size // 400))
-        starts = np.arange(0, each.pixels.size, step)
-        edges = np.append(each.edges[starts], each.edges[-1])
-        shares = np.add.reduceat(each.pixels, starts) / max(each.pixels.sum(), 1) / np.diff(edges)
-        axes.stairs(shares, edges, label=f"{each.kind.name.lower()} ({each.frames} of {each.of} frames)")
+        step = max(1, -(-each.bin_counts.size // 400))
+        starts = np.arange(0, each.bin_counts.size, step)
+        edges = np.append(each.bin_edges[starts], each.bin_edges[-1])
+        shares = np.add.reduceat(each.bin_counts, starts) / max(each.bin_counts.sum(), 1) / np.diff(edges)
+        axes.stairs(shares, edges, label=f"{each.kind.name.lower()} ({each.frames} of {each.n_all} frames)")
     axes.set_yscale("log")
     finish(axes, "pixel value, as stored", "share of pixels per unit")
     return png(figure)

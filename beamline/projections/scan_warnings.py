@@ -36,8 +36,8 @@ def warn_of_units(scan: SelectedScan, warn: Warn) -> None:
     for sentence in dict.fromkeys(doubt(name, value) for name, value in stated):
         if sentence:
             warn(sentence)
-    if turned := source.attributes.get("turned"):
-        warn(Note(str(turned)))
+    if orientation_note := source.attributes.get("turned"):
+        warn(Note(str(orientation_note)))
     if (cone := selection.cone or source.cone) is not None and cone[1] < _LEAST_MAGNIFICATION * cone[0]:
         sod = cone[0]
         sdd = cone[1]
@@ -125,13 +125,13 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
         first_row: row of the detector at which the (binned) rows begin.
     """
     what = "slice" if prepared.geometry.rows_show_slices else "row"
-    corrected, (lost, between) = prepared.corrected, prepared.unmeasured_rows
+    corrected, (lost_rows, interpolated_rows) = prepared.corrected, prepared.unmeasured_rows
     masked, runs = corrected.masked.copy(), corrected.unmeasured
-    masked[lost] = False
-    unseen, runs = areas(corrected.masked) & masked, runs[~np.isin(runs[:, 1], lost)]
+    masked[lost_rows] = False
+    unseen, runs = areas(corrected.masked) & masked, runs[~np.isin(runs[:, 1], lost_rows)]
     if runs.size:
-        frames, within = np.unique(runs[:, 0]), first_row + np.arange(binning)
-        rows = spans((binning * np.unique(runs[:, 1])[:, None] + within).ravel().tolist(), 4)
+        frames, bin_rows = np.unique(runs[:, 0]), first_row + np.arange(binning)
+        rows = spans((binning * np.unique(runs[:, 1])[:, None] + bin_rows).ravel().tolist(), 4)
         ends = np.unique(runs[:, 2:], axis=0) * binning
         cols = spans(np.unique(np.concatenate([np.arange(*each) for each in ends])).tolist(), 4)
         warn(
@@ -171,12 +171,12 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
     for share, kind, text in shares:
         if share > 1e-3:
             warn(kind(text.format(share=f"{share:.1%}")))
-    for dead_rows, so in (
-        (np.setdiff1d(lost, between), "0 in the volume"),
-        (between, "interpolated from their neighbours"),
+    for dead_rows, result_of_slices in (
+        (np.setdiff1d(lost_rows, interpolated_rows), "0 in the volume"),
+        (interpolated_rows, "interpolated from their neighbours"),
     ):
         if dead_rows.size:
-            result = so if what == "slice" else "not used, and voxels that other rows do not show are 0"
+            result = result_of_slices if what == "slice" else "not used, and voxels that other rows do not show are 0"
             warn(
                 f"No data in {count(dead_rows.size, what)} of {len(masked)} (counted from 0: "
                 f"{spans(dead_rows.tolist())}), because in all projections these detector rows have no beam, zeros, "

@@ -156,7 +156,7 @@ class ScanSelection(Selection):
                 was given for a parallel beam.
         """
         rows, pitch = self.detector_rows, self.pixel_size_mm
-        full = (rows.stop - rows.start, self.shape[1])
+        unbinned_shape = (rows.stop - rows.start, self.shape[1])
         if self.cone is not None:
             if pitch is None:
                 raise ConfigError(
@@ -164,13 +164,13 @@ class ScanSelection(Selection):
                     "not state it."
                 )
             # The central ray meets the same detector row whatever rows are read.
-            meets = (self.shape[0] - 1) / 2 if self.central_row is None else self.central_row
+            central_row = (self.shape[0] - 1) / 2 if self.central_row is None else self.central_row
             try:
-                if self.cone[1] < (width := full[1] * pitch) / math.sqrt(2):
+                if self.cone[1] < (width := unbinned_shape[1] * pitch) / math.sqrt(2):
                     sdd = self.cone[1]
                     raise ValueError(f"the source would be only {sdd:g} mm from a detector that is {width:.4g} mm wide")
                 geometry = Geometry.cone(
-                    angles, full, pitch, *self.cone, axis_col=axis_col, axis_row=meets - rows.start
+                    angles, unbinned_shape, pitch, *self.cone, axis_col=axis_col, axis_row=central_row - rows.start
                 )  # fmt: skip
             except ValueError as error:
                 raise ConfigError(f"{self.path}: {error}. Give the right distances with --cone SOD:SDD.") from error
@@ -181,7 +181,7 @@ class ScanSelection(Selection):
                 "is a parallel-beam scan."
             )
         pitch = 1.0 if pitch is None else pitch
-        return Geometry.parallel(angles, full, pixel_pitch=pitch, axis_col=axis_col).binned(self.binning)
+        return Geometry.parallel(angles, unbinned_shape, pixel_pitch=pitch, axis_col=axis_col).binned(self.binning)
 
 
 @dataclass(frozen=True, eq=False)

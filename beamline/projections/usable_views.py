@@ -62,13 +62,13 @@ class Regions:
             return None
         height, width = shape
         weights = np.ones((view_ids.size, height, width), np.float32)
-        places = None if self.resampling is None else self.resampling.places(shape, rows.start)
+        positions = None if self.resampling is None else self.resampling.positions(shape, rows.start)
         view_of = {int(frame): view for view, frame in enumerate(view_ids)}
         for frame, (top, bottom, left, right), share in zip(
             self.frames[chosen].tolist(), self.boxes[chosen].tolist(), self.shares[chosen].tolist(), strict=True
         ):
-            if places is not None:
-                row, col = places
+            if positions is not None:
+                row, col = positions
                 inside = (row > top - 1) & (row < bottom) & (col > left - 1) & (col < right)
                 weights[view_of[frame]][inside] *= share
                 continue
@@ -76,9 +76,9 @@ class Regions:
             if not any(edge % binning for edge in (first, end, left, right)):
                 weights[view_of[frame], first // binning : end // binning, left // binning : right // binning] *= share
                 continue
-            fine = np.ones((1, height * binning, width * binning), np.float32)
-            fine[0, first:end, left:right] = share
-            weights[view_of[frame]] *= bin_views(fine, binning)[0]
+            unbinned = np.ones((1, height * binning, width * binning), np.float32)
+            unbinned[0, first:end, left:right] = share
+            weights[view_of[frame]] *= bin_views(unbinned, binning)[0]
         return weights
 
 
@@ -147,15 +147,15 @@ def usable_views(scan: ScanEvidence, use_flags: bool) -> UsableViews:
         n = f"{with_alarm} with an alarm and {n_warned} with a warning"
         sentence = f"--flags ignore: {n} are used as they are."
         return UsableViews(scan, rows, sentence=sentence, flags=flags)
-    treated = flag_policy(flags, views, scan.source.shape)
-    if not treated.in_words:
-        return UsableViews(scan, rows, flags=flags, jumps=treated.jumps)
-    weights = np.where(treated.halved, np.float32(WARNED_WEIGHT), np.float32(1)) if treated.halved.any() else None
-    good = np.flatnonzero(views & ~treated.left_out)
-    gap = gap_sentence(scan, rows, good)
-    sentence = f"{treated.in_words}{gap and f' They{gap}.'} --flags ignore weighs all projections equally."
-    regions = regions_of(treated)
-    return UsableViews(scan, good, weights, int(treated.left_out.sum()), sentence, flags, regions, treated.jumps)
+    policy = flag_policy(flags, views, scan.source.shape)
+    if not policy.in_words:
+        return UsableViews(scan, rows, flags=flags, jumps=policy.jumps)
+    weights = np.where(policy.halved, np.float32(WARNED_WEIGHT), np.float32(1)) if policy.halved.any() else None
+    kept_rows = np.flatnonzero(views & ~policy.left_out)
+    gap = gap_sentence(scan, rows, kept_rows)
+    sentence = f"{policy.in_words}{gap and f' They{gap}.'} --flags ignore weighs all projections equally."
+    regions = regions_of(policy)
+    return UsableViews(scan, kept_rows, weights, int(policy.left_out.sum()), sentence, flags, regions, policy.jumps)
 
 
 def gap_sentence(scan: ScanEvidence | ScanSource, before: NDArray[np.int64], after: NDArray[np.int64]) -> str:
@@ -175,9 +175,9 @@ def _widest_gap(angles: NDArray[np.float64], period: float) -> float:
     return period if sorted_angles.size == 0 else float(np.diff(sorted_angles, append=sorted_angles[0] + period).max())
 
 
-def regions_of(treated: FlagPolicy) -> Regions:
+def regions_of(policy: FlagPolicy) -> Regions:
     """The regions of warnings and alarms in frames. Rays in the region of an alarm have weight 0."""
-    frames, boxes, alarms = zip(*treated.parts, strict=True) if treated.parts else ((), (), ())
+    frames, boxes, alarms = zip(*policy.parts, strict=True) if policy.parts else ((), (), ())
     shares = np.where(np.array(alarms, np.bool_), np.float32(0), np.float32(WARNED_SHARE))
     return Regions(np.array(frames, np.int64), np.array(boxes, np.int64).reshape(-1, 4), shares)
 

@@ -118,7 +118,7 @@ class ViewGeometry:
         return geometry
 
 
-_OF_A_CIRCLE = angles_shown.ORDER, "axis"  # these rules do not apply if vectors state the pose of each projection
+_ROTATION_RULES = angles_shown.ORDER, "axis"  # these rules do not apply if vectors state the pose of each projection
 
 
 def select(source: ScanSource, selection: Selection) -> SelectedScan:
@@ -152,7 +152,7 @@ def checked_views(scan: SelectedScan, warn: Warn) -> UsableViews:
     findings = [hit for hit in findings_of(scan.evidence) if by_option.get(hit.rule) is None]
     findings = [hit for hit in findings if hit.rule != FLAGS or (preparation.uses_flags and hit.severity == "error")]
     if (poses := stated_poses(scan)) is not None and poses.vectors is not None:
-        findings = [finding for finding in findings if finding.rule not in _OF_A_CIRCLE]
+        findings = [finding for finding in findings if finding.rule not in _ROTATION_RULES]
     refuse(scan.source, findings)
     usable = usable_views(scan.evidence, preparation.uses_flags)
     if usable.sentence:

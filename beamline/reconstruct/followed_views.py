@@ -126,7 +126,7 @@ class AxisSearch:
         search = replace(search, next_views=views.size + views.size // 2, settled=ended)
         last_chance = ended and known is None
         try:
-            located = locate_axis(plan, views, warn, all_there=ended)
+            located = locate_axis(plan, views, warn, complete=ended)
         except DataError:  # the projections do not cover enough angles yet
             if last_chance:
                 raise

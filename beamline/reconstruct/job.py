@@ -222,10 +222,10 @@ def _volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedPr
         result = _at_once(job, decided)
         return replace(result, outside=None), without_outside(prepared, result)
     result = _by_slabs(job, decided)
-    if not job.options.method.weighs and prepared.sources.of_views is not None:
+    if not job.options.method.weighs and prepared.sources.view_weights is not None:
         # Only recorded, because FBP and its figures of merit treat all rays equally.
-        result = replace(result, settings={**result.settings, "view_weights": prepared.sources.of_views})
-        prepared = replace(prepared, sources=replace(prepared.sources, of_views=None))
+        result = replace(result, settings={**result.settings, "view_weights": prepared.sources.view_weights})
+        prepared = replace(prepared, sources=replace(prepared.sources, view_weights=None))
     return result, prepared
 
 

@@ -189,7 +189,10 @@ def refuse_whole(scan: SelectedScan, options: ReconOptions, needs: ReconMemory, 
         )
     poses = stated_poses(scan)
     whole = {
-        **{f"{step.asked_by} with roll or tilt": step.may_lean for step in geometry_steps(options.selection)},
+        **{
+            f"{step.requested_by} with roll or tilt": step.may_roll_or_tilt
+            for step in geometry_steps(options.selection)
+        },
         "--poses with roll, tilt or vectors": poses is not None and poses.leans,
         "--checkpoint and --resume": options.checkpoints.wanted,
         "--early-stop": options.method.stops_early,

@@ -262,7 +262,7 @@ def _for_method(
         ConfigError, DataError: there are too few projections, or too little disk space.
     """
     with refused(options.source.path, f" by {options.method.name}"):
-        prepared = prepared.wanted(options.method.views_wanted(prepared.geometry))
+        prepared = prepared.selecting(options.method.views_wanted(prepared.geometry))
     if options.uncertainty:
         refuse_views(options.method_for(prepared.geometry), prepared.geometry)
     if options.cluster is not None and not plan.slabs:

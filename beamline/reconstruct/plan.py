@@ -119,8 +119,8 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
             the sample extends beyond the field of view, or the rays need weights.
     """
     geometry = prepared.geometry
-    method, shares = options.method, prepared.sources.shares
-    differ = not plan.slabs or prepared.views.weights is not None or prepared.sources.shares_of is not None
+    method, shares = options.method, prepared.sources.region_weights
+    differ = not plan.slabs or prepared.views.weights is not None or prepared.sources.region_weights_of is not None
     weighted, reach = differ if method.weighs else shares is not None, prepared.lines.reach
     needs = ReconMemory(
         options.method_for(geometry), geometry, 0, weighted, bars=options.uncertainty,

@@ -120,7 +120,7 @@ def _record(outcome: MadeVolume, checked: CheckedVolume, now: float) -> tuple[Re
     result, prepared, target, context = outcome.result, outcome.prepared, outcome.target, outcome.context
 
     def written(volume: Volume) -> Volume:
-        return prepared.stretched(volume if context.region is None else context.region.cut(volume))
+        return prepared.with_true_heights(volume if context.region is None else context.region.cut(volume))
 
     volumes = {method: written(volume) for method, volume in checked.volumes.items()}
     record = ReconRecord(
@@ -218,8 +218,8 @@ def parameters_of(outcome: MadeVolume) -> dict[str, Value]:
     parts = np.unique(prepared.corrected.unmeasured[:, 0]), prepared.unmeasured_rows[0]
     unmeasured = zip(("frames_unmeasured_in_part", "rows_unmeasured"), parts, strict=True)
     parameters |= {name: numbers for name, numbers in unmeasured if numbers.size}
-    if prepared.sources.of_views is not None:
-        parameters["view_weights"] = prepared.sources.of_views
+    if prepared.sources.view_weights is not None:
+        parameters["view_weights"] = prepared.sources.view_weights
     if facts.frames_per_view > 1:
         parameters["frames_per_view"] = facts.frames_per_view
     texts = {"columns": facts.columns, "scan_ended": facts.ended, "recipe": context.recipe}

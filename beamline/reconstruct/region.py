@@ -105,7 +105,7 @@ def rows_around(scan: SelectedScan, region: Region, halo: int) -> SelectedScan:
         )
     poses = stated_poses(scan)
     moving = [(step, term) for step in geometry_steps(selection) for term in ("roll", "tilt", "shifts")]
-    obstacles = [f"{step.asked_by} {term}" for step, term in moving if term in step.geometry]
+    obstacles = [f"{step.requested_by} {term}" for step, term in moving if term in step.geometry]
     if poses is not None and (poses.shifts[:, 1].any() or poses.leans):
         obstacles.append("--poses along the axis, or with roll, tilt or vectors")
     if obstacles:

@@ -47,7 +47,7 @@ def compose(
     metrics, judgement = checked.metrics, checked.judgement
     settings = {
         k: as_text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k not in ("command", "recipe")
-    } | {f"law: {name}": residual for name, residual in prepared.origin.laws.items()}
+    } | {f"law: {name}": residual for name, residual in prepared.origin.consistency.items()}
     return Report(
         title=f"{context.facts.sample or context.facts.name}: {label_of(result.method)}",
         summary=_summary(outcome, metrics),

@@ -255,7 +255,7 @@ def _record(prepared: PreparedProjections, options: ReconOptions, grid: Grid, no
     """The record of a partial volume, without voxels."""
     path = Path(options.source.path)
     return ReconRecord(
-        volume=prepared.stretched(Volume(np.broadcast_to(np.float32(0), grid.shape), grid)),
+        volume=prepared.with_true_heights(Volume(np.broadcast_to(np.float32(0), grid.shape), grid)),
         length_unit=prepared.origin.length_unit,
         raw_file=str(path.resolve()),
         title=f"Partial reconstruction of {path.name}",

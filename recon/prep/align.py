@@ -86,26 +86,26 @@ def axis_from_opposites(projections: NDArray[np.floating], angles: Floats) -> Ax
     a, b = _opposites(projections, angles)
     cols = projections.shape[2]
     candidates = np.arange(2 * _FEWEST, 2 * (cols - 1 - _FEWEST) + 1) / 2
-    root = np.sqrt(np.minimum(2 * candidates, 2 * (cols - 1 - candidates)))
+    root_columns = np.sqrt(np.minimum(2 * candidates, 2 * (cols - 1 - candidates)))
 
-    views = _Mirrored.of(_rows_of(a), _rows_of(b), candidates - 0.5)
+    mirrored = _Mirrored.of(_rows_of(a), _rows_of(b), candidates - 0.5)
     pairs, height = a.shape[:2]
 
     def score_of(curve: Floats) -> Floats:
-        return np.arctanh(np.clip(1 - curve, -_PERFECT, _PERFECT)) * root
+        return np.arctanh(np.clip(1 - curve, -_PERFECT, _PERFECT)) * root_columns
 
-    curve = views.mismatch()
+    curve = mirrored.mismatch()
     score = score_of(curve)
     optimum(candidates, score.max() - score)  # raises an error if the axis is at the edge
     best = int(score.argmax())
-    near = slice(best - 1, best + 2)
-    value = lowest(candidates[near], curve[near])[0]
+    around_best = slice(best - 1, best + 2)
+    value = lowest(candidates[around_best], curve[around_best])[0]
     middle = pairs // 2 * height  # neighbouring projections are similar; projections 90° apart are not
-    halves = [score_of(views.mismatch(part)) for part in (slice(middle), slice(middle, None))]
-    apart = max(abs(float(candidates[half.argmax()]) - value) for half in halves)
-    turned = np.unique(np.linspace(1, pairs - 1, min(pairs - 1, _PAIRINGS)).astype(int))
-    confident = apart < AGREE and all(
-        score[best] > score_of(views.mismatch(others=int(n) * height)).max() for n in turned
+    halves = [score_of(mirrored.mismatch(part)) for part in (slice(middle), slice(middle, None))]
+    difference = max(abs(float(candidates[half.argmax()]) - value) for half in halves)
+    pair_offsets = np.unique(np.linspace(1, pairs - 1, min(pairs - 1, _PAIRINGS)).astype(int))
+    confident = difference < AGREE and all(
+        score[best] > score_of(mirrored.mismatch(offset=int(n) * height)).max() for n in pair_offsets
     )
     return AxisEstimate(value, candidates, curve, confident, "opposite views")
 
@@ -118,8 +118,8 @@ def _opposites(projections: NDArray[np.floating], angles: Floats) -> tuple[Float
         raise ValueError(
             f"found {first.size} pairs of opposite projections (180° apart); at least {_FEWEST_PAIRS} are needed"
         )
-    some = np.unique(np.linspace(0, first.size - 1, min(first.size, _MOST_PAIRS)).astype(int))
-    first, opposite = first[some], opposite[some]
+    sampled = np.unique(np.linspace(0, first.size - 1, min(first.size, _MOST_PAIRS)).astype(int))
+    first, opposite = first[sampled], opposite[sampled]
     data = few_rows(projections[np.concatenate((first, opposite))])
     if not np.isfinite(data).all():
         raise ValueError("the projections contain NaN or infinite values; correct them first")
@@ -131,9 +131,9 @@ def _opposites(projections: NDArray[np.floating], angles: Floats) -> tuple[Float
 def _opposite_pairs(angles: Floats, cols: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Projections of one half turn, and the projections that are opposite to them within 2 / cols radians."""
     theta = np.mod(angles, 2 * np.pi)
-    away = np.abs(np.mod(theta[:, None] - theta + np.pi, 2 * np.pi) - np.pi)
-    opposite = away.argmax(axis=1)
-    exact = np.pi - away[np.arange(theta.size), opposite] < max(2 / cols, 1e-9)
+    distances = np.abs(np.mod(theta[:, None] - theta + np.pi, 2 * np.pi) - np.pi)
+    opposite = distances.argmax(axis=1)
+    exact = np.pi - distances[np.arange(theta.size), opposite] < max(2 / cols, 1e-9)
     first = np.flatnonzero(exact & (theta < theta[opposite]))
     first = first[np.argsort(theta[first], kind="stable")]
     return first, opposite[first]
@@ -182,21 +182,21 @@ class _Mirrored:
             cumulative = np.concatenate([np.zeros((rows, 1)), np.cumsum(x, axis=1)], axis=1)
             return cumulative[:, last] - cumulative[:, first]
 
-        added = [sums(x) for x in sets]
-        variances = [sums(x * x) - of_x**2 / (last - first) for x, of_x in zip(sets, added, strict=True)]
-        one, other = sets
+        column_sums = [sums(x) for x in sets]
+        variances = [sums(x * x) - of_x**2 / (last - first) for x, of_x in zip(sets, column_sums, strict=True)]
+        first_set, second_set = sets
         return cls(
-            total, n, last - first, (fft.rfft(one, n), fft.rfft(other, n)), (added[0], added[1]),
-            (variances[0], variances[1]), ((one * one).sum(axis=1), (other * other).sum(axis=1)),
+            total, n, last - first, (fft.rfft(first_set, n), fft.rfft(second_set, n)), (column_sums[0], column_sums[1]),
+            (variances[0], variances[1]), ((first_set * first_set).sum(axis=1), (second_set * second_set).sum(axis=1)),
         )  # fmt: skip
 
-    def mismatch(self, rows: slice = _ALL, others: int = 0) -> Floats:
-        """Mismatch [candidate] of row i of the first set with row i - `others` of the second set, for some rows i
+    def mismatch(self, rows: slice = _ALL, offset: int = 0) -> Floats:
+        """Mismatch [candidate] of row i of the first set with row i - `offset` of the second set, for some rows i
         together."""
-        (fa, fb), (sum_a, sum_b) = self.spectra, self.sums
-        if others:
-            fb, sum_b = np.roll(fb, others, axis=0), np.roll(sum_b, others, axis=0)
-        product = fft.irfft(np.einsum("rk,rk->k", fa[rows], fb[rows]), self.length)[self.total]
+        (spectrum_a, spectrum_b), (sum_a, sum_b) = self.spectra, self.sums
+        if offset:
+            spectrum_b, sum_b = np.roll(spectrum_b, offset, axis=0), np.roll(sum_b, offset, axis=0)
+        product = fft.irfft(np.einsum("rk,rk->k", spectrum_a[rows], spectrum_b[rows]), self.length)[self.total]
         covariance = product - np.einsum("rk,rk->k", sum_a[rows], sum_b[rows]) / self.count
         variance = self.variances[0][rows].sum(axis=0) * self.variances[1][rows].sum(axis=0)
         usable = variance > 1e-6 * self.powers[0][rows].sum() * self.powers[1][rows].sum()
@@ -248,15 +248,15 @@ def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
     warn_of_degrees(theta)
     warn_of_other_quantity(projections)
     try:
-        from_all = axis_from_sinogram(projections, theta)
+        from_all_views = axis_from_sinogram(projections, theta)
     except AxisError:
-        if (from_some := _from_some(projections, theta)) is None:
+        if (from_pairs_or_ends := _from_pairs_or_ends(projections, theta)) is None:
             raise
-        return from_some
-    return from_all if from_all.confident else _from_some(projections, theta) or from_all
+        return from_pairs_or_ends
+    return from_all_views if from_all_views.confident else _from_pairs_or_ends(projections, theta) or from_all_views
 
 
-def _from_some(projections: NDArray[np.floating], theta: Floats) -> AxisEstimate | None:
+def _from_pairs_or_ends(projections: NDArray[np.floating], theta: Floats) -> AxisEstimate | None:
     """The axis from opposite projections if they show it clearly.
 
     Otherwise the estimate from the ends of the 180° scan (if the sample is wider than the field of view) or from a pair
@@ -280,12 +280,12 @@ def _from_some(projections: NDArray[np.floating], theta: Floats) -> AxisEstimate
 def closest_pair(theta: Floats, tolerance: float) -> tuple[int, int] | None:
     """The two projections that are nearest to 180° apart; None if no pair is within the tolerance (radians)."""
     order = np.argsort(np.mod(theta, 2 * np.pi))
-    turned = np.mod(theta[order], 2 * np.pi)
-    extended = np.concatenate([turned, turned + 2 * np.pi])
-    index = np.searchsorted(extended, turned + np.pi)
-    options = np.stack([np.clip(index - 1, 0, None), np.clip(index, None, extended.size - 1)])
-    miss = np.abs(extended[options] - turned - np.pi)
-    side, first = np.unravel_index(int(miss.argmin()), miss.shape)
-    if miss[side, first] > tolerance:
+    sorted_theta = np.mod(theta[order], 2 * np.pi)
+    extended = np.concatenate([sorted_theta, sorted_theta + 2 * np.pi])
+    index = np.searchsorted(extended, sorted_theta + np.pi)
+    neighbours = np.stack([np.clip(index - 1, 0, None), np.clip(index, None, extended.size - 1)])
+    deviations = np.abs(extended[neighbours] - sorted_theta - np.pi)
+    neighbour, first = np.unravel_index(int(deviations.argmin()), deviations.shape)
+    if deviations[neighbour, first] > tolerance:
         return None
-    return int(order[first]), int(order[options[side, first] % order.size])
+    return int(order[first]), int(order[neighbours[neighbour, first] % order.size])

@@ -51,9 +51,9 @@ def axis_from_ends(projections: NDArray[np.floating], angles: Floats) -> AxisEst
     cols = data.shape[2]
     curve, error = np.full(_FINER * cols, np.inf), 0.0
     # first all windows, then windows about the axes that the first ones show
-    totals = {round(2 * share * cols) for share in (0.4, 0.5, 0.6)}
-    for total in {round(2 * lowest(*_join(data, each, times)[:2])[0]) for each in totals}:
-        candidates, values, errors = _join(data, total, times)
+    twice_centres = {round(2 * share * cols) for share in (0.4, 0.5, 0.6)}
+    for twice_centre in {round(2 * lowest(*_join(data, each, times)[:2])[0]) for each in twice_centres}:
+        candidates, values, errors = _join(data, twice_centre, times)
         bins = np.round(_FINER * candidates).astype(int)
         error = float(np.median(errors)) if values.min() < curve.min() else error
         curve[bins] = np.minimum(curve[bins], values)
@@ -67,31 +67,31 @@ def axis_from_ends(projections: NDArray[np.floating], angles: Floats) -> AxisEst
 def _half_turn(theta: Floats) -> tuple[NDArray[np.intp], Floats]:
     """The projections of 180° in order, and the angles, in steps, of the last (mirrored) and of the first of them."""
     order = np.argsort(theta, kind="stable")
-    turned = theta[order] - theta[order[0]]
-    step = float(np.median(np.diff(turned)))
-    order, turned = order[turned < np.pi + step / 2], turned[turned < np.pi + step / 2]
+    rotation = theta[order] - theta[order[0]]
+    step = float(np.median(np.diff(rotation)))
+    order, rotation = order[rotation < np.pi + step / 2], rotation[rotation < np.pi + step / 2]
     # if there are many projections, the subset that is used has uneven steps
-    if order.size < _FEWEST or max(np.diff(turned).max(), np.pi - turned[-1]) > 2.5 * step:
+    if order.size < _FEWEST or max(np.diff(rotation).max(), np.pi - rotation[-1]) > 2.5 * step:
         raise ValueError(f"the projections do not cover 180° in {_FEWEST} or more even steps")
-    return order, np.concatenate((turned[-_SIDE:] - np.pi, turned[:_SIDE])) / step
+    return order, np.concatenate((rotation[-_SIDE:] - np.pi, rotation[:_SIDE])) / step
 
 
-def _join(data: Floats, total: int, times: Floats) -> tuple[Floats, Floats, Floats]:
+def _join(data: Floats, twice_centre: int, times: Floats) -> tuple[Floats, Floats, Floats]:
     """Candidate columns for the axis, the mismatch of each, and the errors [join] in columns at joins within the scan.
 
     Args:
         data: [view, row, col]. `times` are the times of its last and of its first projections.
-        total: twice the column of the centre of the window.
+        twice_centre: twice the column of the centre of the window.
     """
     n, _, cols = data.shape
-    total = min(max(total, cols // 2), 3 * cols // 2)
-    window = data[..., max(0, total - cols + 1) : min(total, cols - 1) + 1]
+    twice_centre = min(max(twice_centre, cols // 2), 3 * cols // 2)
+    window = data[..., max(0, twice_centre - cols + 1) : min(twice_centre, cols - 1) + 1]
     cols = window.shape[2]
     mean, taper = window.mean(axis=0), np.hanning(cols + 2)[1:-1]
-    seen = window - (mean + mean[:, ::-1]) / 2  # both ends share the even part, so the even part makes no seam
-    seen = (seen - np.average(seen, axis=2, weights=taper)[..., None]) * taper
+    asymmetric = window - (mean + mean[:, ::-1]) / 2  # both ends share the even part, so the even part makes no seam
+    asymmetric = (asymmetric - np.average(asymmetric, axis=2, weights=taper)[..., None]) * taper
     length = fft.next_fast_len(2 * cols, real=True)
-    spectra, late = (fft.rfft(each, length, axis=2)[..., 1:] for each in (seen, seen[-_SIDE:, :, ::-1]))
+    spectra, late = (fft.rfft(each, length, axis=2)[..., 1:] for each in (asymmetric, asymmetric[-_SIDE:, :, ::-1]))
     offsets = np.arange(-cols * _FINER // 4, cols * _FINER // 4 + 1)
 
     def likelihood(late: NDArray[np.complex128], early: NDArray[np.complex128], weights: Floats) -> Floats:
@@ -100,31 +100,35 @@ def _join(data: Floats, total: int, times: Floats) -> tuple[Floats, Floats, Floa
         return fft.irfft(product, 2 * (product.size - 1))[offsets]
 
     centred = spectra - spectra.mean(axis=0)
-    pairs = [(centred[: n - lag].conj() * centred[lag:]).real.sum(axis=1) for lag in range(2 * _SIDE + 2)]
-    joins, whole = list[Floats](), list[float]()
+    lagged_products = [(centred[: n - lag].conj() * centred[lag:]).real.sum(axis=1) for lag in range(2 * _SIDE + 2)]
+    curves, best_matches = list[Floats](), list[float]()
     for block in np.array_split(np.arange(n), min(_BLOCKS, n // (2 * _SIDE))):
         used = np.isin(np.arange(n), block, invert=True)
-        weights, mean = _weights(pairs, used, np.arange(2.0 * _SIDE)), spectra[used].mean(axis=0)
+        weights, mean = _weights(lagged_products, used, np.arange(2.0 * _SIDE)), spectra[used].mean(axis=0)
         for j in range(_SIDE, block.size - _SIDE + 1, 1 + block.size // 20):
             before, after = spectra[block[j - _SIDE : j]], spectra[block[j : j + _SIDE]]
-            joins.append(likelihood(before - mean, after - mean, weights))
-            whole.append(float(likelihood(before, after, weights).max()))
-    curve = likelihood(late, spectra[:_SIDE], _weights(pairs, np.ones(n, np.bool_), times))
-    errors = np.array([abs(lowest(offsets / _FINER, -each)[0]) for each in joins])
-    return total / 2 + offsets / _FINER, 1 - curve / np.median(whole), errors
+            curves.append(likelihood(before - mean, after - mean, weights))
+            best_matches.append(float(likelihood(before, after, weights).max()))
+    curve = likelihood(late, spectra[:_SIDE], _weights(lagged_products, np.ones(n, np.bool_), times))
+    errors = np.array([abs(lowest(offsets / _FINER, -each)[0]) for each in curves])
+    return twice_centre / 2 + offsets / _FINER, 1 - curve / np.median(best_matches), errors
 
 
-def _weights(pairs: list[Floats], used: NDArray[np.bool_], times: Floats) -> Floats:
+def _weights(lagged_products: list[Floats], used: NDArray[np.bool_], times: Floats) -> Floats:
     """[frequency, late, early] weights of products of projections at these `times` (steps), from a covariance.
 
     Args:
-        pairs: [lag] of [view, frequency], products of each projection with the one `lag` steps later.
+        lagged_products: [lag] of [view, frequency], products of each projection with the one `lag` steps later.
         used: the projections from which the covariance is computed.
     """
-    power = np.stack([each[used[: len(each)] & used[used.size - len(each) :]].mean(axis=0) for each in pairs])
-    apart = np.abs(times[:, None] - times)
-    below = np.minimum(apart.astype(int), len(pairs) - 2)
-    share = (apart - below)[..., None]
-    size, axes = np.linalg.eigh(np.moveaxis((1 - share) * power[below] + share * power[below + 1], 2, 0))
-    inverse = np.einsum("kij,kj,klj->kil", axes, 1 / (np.maximum(size, 0) + _NOISE * power[0][:, None]), axes)
+    power = np.stack([each[used[: len(each)] & used[used.size - len(each) :]].mean(axis=0) for each in lagged_products])
+    lags = np.abs(times[:, None] - times)
+    whole_lags = np.minimum(lags.astype(int), len(lagged_products) - 2)
+    fractions = (lags - whole_lags)[..., None]
+    eigenvalues, eigenvectors = np.linalg.eigh(
+        np.moveaxis((1 - fractions) * power[whole_lags] + fractions * power[whole_lags + 1], 2, 0)
+    )
+    inverse = np.einsum(
+        "kij,kj,klj->kil", eigenvectors, 1 / (np.maximum(eigenvalues, 0) + _NOISE * power[0][:, None]), eigenvectors
+    )
     return -inverse[:, :_SIDE, _SIDE:]

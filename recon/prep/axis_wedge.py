@@ -61,8 +61,8 @@ def lowest(candidates: Floats, curve: Floats) -> tuple[float, int]:
     if not 0 < i < curve.size - 1:
         return float(candidates[i]), i
     below, here, above = curve[i - 1 : i + 2]
-    bend = below - 2 * here + above
-    shift = 0.5 * (below - above) / bend if bend > 0 else 0.0
+    curvature = below - 2 * here + above
+    shift = 0.5 * (below - above) / curvature if curvature > 0 else 0.0
     return float(candidates[i] + shift * (candidates[1] - candidates[0])), i
 
 
@@ -158,23 +158,23 @@ def _axis_from_mass(data: Floats, theta: Floats) -> AxisEstimate:
     covariance = np.linalg.pinv(basis.T @ basis)
     solution = covariance @ (basis.T @ centre)
     residual = centre - basis @ solution
-    value, left_over = float(solution[0]), float(residual @ residual)
+    value, residual_squares = float(solution[0]), float(residual @ residual)
     # An error of the axis adds this much per px² to the sum of squares; the curve is in units of a quarter of the
     # field.
     rise = 1 / covariance[0, 0]
     candidates = np.arange(0, cols - 1 + _STEP / 2, _STEP)
-    curve = (left_over + rise * (candidates - value) ** 2) / (rise * (cols / 4) ** 2)
+    curve = (residual_squares + rise * (candidates - value) ** 2) / (rise * (cols / 4) ** 2)
     if not candidates[0] < value < candidates[-1]:
         raise axis_error(value, candidates, "outside them")
     # Residuals of neighbouring projections are correlated. An air level that is not zero shifts the estimate without
     # adding scatter.
-    correlation = float(np.clip(residual[1:] @ residual[:-1] / max(left_over, 1e-30), 0, 0.99))
-    error = np.sqrt(left_over / max(len(theta) - 3, 1) / rise * (1 + correlation) / (1 - correlation))
+    correlation = float(np.clip(residual[1:] @ residual[:-1] / max(residual_squares, 1e-30), 0, 0.99))
+    error = np.sqrt(residual_squares / max(len(theta) - 3, 1) / rise * (1 + correlation) / (1 - correlation))
     edge = max(2, cols // 40)
     left, right = float(profile[:, :edge].mean()), float(profile[:, -edge:].mean())
     bias = abs(left - right) / 2 * cols**2 / 6 + abs(left + right) / 2 * cols * abs(value - (cols - 1) / 2)
-    whole = max(abs(left), abs(right)) < 0.05 * profile.max() and mass.std() < 0.03 * mass.mean()
-    confident = whole and 2 * error + bias / mass.mean() < AGREE
+    sample_inside = max(abs(left), abs(right)) < 0.05 * profile.max() and mass.std() < 0.03 * mass.mean()
+    confident = sample_inside and 2 * error + bias / mass.mean() < AGREE
     return AxisEstimate(value, candidates, curve, bool(confident), "centre of mass")
 
 
@@ -196,10 +196,10 @@ def _covers_half_a_turn(theta: Floats) -> bool:
     return bool(gap <= max(_WIDEST_GAP, 4 * np.pi / len(theta)))
 
 
-def is_cut_off(part: NDArray[np.floating]) -> bool:
+def is_cut_off(lines: NDArray[np.floating]) -> bool:
     """Whether the sample is truncated: the first or last columns of line integrals [view, row, col] are not air."""
-    rim = np.abs(part[:, :, [0, 1, -2, -1]].mean(axis=(0, 1))).max()
-    return bool(rim > 0.05 * part.mean(axis=(0, 1)).max())
+    rim = np.abs(lines[:, :, [0, 1, -2, -1]].mean(axis=(0, 1))).max()
+    return bool(rim > 0.05 * lines.mean(axis=(0, 1)).max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,15 +225,15 @@ class _Wedge:
     @classmethod
     def of(cls, data: Floats, theta: Floats) -> _Wedge:
         """The residuals, computed from only as many projections and columns as are necessary."""
-        views = np.argsort(np.mod(theta, np.pi), kind="stable")[:: -(-len(theta) // _MOST_VIEWS)]
+        chosen_views = np.argsort(np.mod(theta, np.pi), kind="stable")[:: -(-len(theta) // _MOST_VIEWS)]
         bin_ = -(-data.shape[2] // _MOST_COLS)
         cols = data.shape[2] // bin_
-        part = data[views, :, : cols * bin_].reshape(len(views), -1, cols, bin_).mean(axis=3)
-        omega, fits = _wedge_residuals(part, theta[views])
+        binned = data[chosen_views, :, : cols * bin_].reshape(len(chosen_views), -1, cols, bin_).mean(axis=3)
+        omega, fits = _wedge_residuals(binned, theta[chosen_views])
         candidates = np.arange(0, cols - 1 + _STEP / 2, _STEP)
         phase = 2 * np.outer(candidates, omega)
         basis = np.stack([np.ones_like(phase), np.cos(phase), np.sin(phase)])
-        return cls(candidates * bin_ + (bin_ - 1) / 2, bin_, basis, omega, fits, 2 if is_cut_off(part) else 1)
+        return cls(candidates * bin_ + (bin_ - 1) / 2, bin_, basis, omega, fits, 2 if is_cut_off(binned) else 1)
 
     def curve(self, fit: Floats, power: int) -> Floats:
         """Mismatch [n] from coefficients [3, frequency]."""
@@ -244,10 +244,10 @@ class _Wedge:
 def _axis_from_wedge(data: Floats, theta: Floats) -> AxisEstimate:
     wedge = _Wedge.of(data, theta)
     # With one harmonic more, and with one less, the axis must be the same.
-    fewer, curve, more = (wedge.curve(wedge.fits.sum(axis=1), wedge.power + by) for by in (-1, 0, 1))
+    fewer, curve, more = (wedge.curve(wedge.fits.sum(axis=1), wedge.power + change) for change in (-1, 0, 1))
     value, depth = optimum(wedge.columns, curve)
-    bands = abs(lowest(wedge.columns, fewer)[0] - lowest(wedge.columns, more)[0])
-    confident = len(theta) >= _FEWEST and depth > 0.5 and bands < AGREE * wedge.bin
+    disagreement = abs(lowest(wedge.columns, fewer)[0] - lowest(wedge.columns, more)[0])
+    confident = len(theta) >= _FEWEST and depth > 0.5 and disagreement < AGREE * wedge.bin
     return AxisEstimate(value, wedge.columns, curve, confident, "double wedge")
 
 
@@ -262,13 +262,13 @@ def _orthonormal(vectors: Floats) -> tuple[Floats, Floats]:
     q = vectors[: vectors.shape[1]].copy()
     lengths = np.zeros(len(q))
     for i, vector in enumerate(q):
-        before = math.sqrt(float(np.einsum("k,k->", vector, vector)))
-        for again in (False, True):
+        given_length = math.sqrt(float(np.einsum("k,k->", vector, vector)))
+        for second_pass in (False, True):
             vector -= np.einsum("j,jk->k", np.einsum("jk,k->j", q[:i], vector), q[:i])
             length = math.sqrt(float(np.einsum("k,k->", vector, vector)))
-            if not again:
+            if not second_pass:
                 lengths[i] = length
-            if length <= _ROUNDING * before:
+            if length <= _ROUNDING * given_length:
                 vector[:] = 0
                 break
             vector /= length

@@ -31,9 +31,9 @@ _WINDOWS = (45, 15, 5, 1)  # numbers of projections that share a surface
 # a smaller window, or a higher order, is used only if it lowers the mean square to this share
 _BETTER_WINDOW, _BETTER_ORDER = 0.95, 0.75
 _BETTER = 0.99  # a surface is used only if it lowers the mean square to this share
-_LEFT = 2.0  # multiple of the noise; if the residual is larger, the rays do not show air
+_MOST_RESIDUAL = 2.0  # multiple of the noise; if the residual is larger, the rays do not show air
 # largest variance of a surface, divided by that of a constant; a larger variance means that the surface extrapolates
-_FARTHEST = 1000.0
+_MOST_EXTRAPOLATION = 1000.0
 _ROWS_A_POWER = 4
 
 
@@ -65,8 +65,8 @@ class Background:
     def confirmed(self, noise: float) -> bool:
         """Whether the correction should be applied: the surface is significant, and the residual in air that was not
         used for the fit is little more than noise."""
-        pays = self.after**2 < _BETTER * self.before**2
-        return self.size >= LEAST_SIZE and pays and self.after < _LEFT * noise + LEAST_SIZE
+        improves = self.after**2 < _BETTER * self.before**2
+        return self.size >= LEAST_SIZE and improves and self.after < _MOST_RESIDUAL * noise + LEAST_SIZE
 
     def remove(self, views: F32, factor: int = 1) -> None:
         """Subtract the surfaces in place from projections [view, row, col] whose pixels are binned by `factor`."""
@@ -94,7 +94,7 @@ def powers(order: int) -> list[tuple[int, int]]:
     return [(total - j, j) for total in range(order + 1) for j in range(total + 1)]
 
 
-def matter(volume: F32, inside: Mask) -> Mask:
+def near_material(volume: F32, inside: Mask) -> Mask:
     """Voxels near material, bool [z, y, x]. A voxel is material if its smoothed value exceeds the air level by five
     standard deviations.
 
@@ -113,8 +113,8 @@ class AirSums:
         """Start the sums for projections of a detector (rows, cols), binned by `factor`."""
         rows, cols = shape[0] // factor, shape[1] // factor
         v, u = coordinate(shape[0], factor), coordinate(shape[1], factor)
-        odd = (np.arange(rows)[:, None] // _BLOCK + np.arange(cols) // _BLOCK) % 2
-        self._shape, self._half = shape, odd.astype(bool)
+        second_half = (np.arange(rows)[:, None] // _BLOCK + np.arange(cols) // _BLOCK) % 2
+        self._shape, self._half = shape, second_half.astype(bool)
         self._terms = np.stack([np.outer(v**j, u**i) for i, j in powers(HIGHEST)], -1)
         self._squares: list[list[F64]] = []  # [view][half] of [term, term]
         self._products: list[list[F64]] = []  # [view][half] of [term]
@@ -125,8 +125,10 @@ class AirSums:
         air = self._without_outliers(view, air)
         parts = []
         for half in (self._half, ~self._half):
-            t, p = self._terms[air & half], view[air & half].astype(np.float64)
-            parts.append((t.T @ t, t.T @ p, (float(p.size), float(p.sum()), float(p @ p))))
+            terms, values = self._terms[air & half], view[air & half].astype(np.float64)
+            parts.append(
+                (terms.T @ terms, terms.T @ values, (float(values.size), float(values.sum()), float(values @ values)))
+            )
         squares, products, totals = zip(*parts, strict=True)
         self._squares.append([*squares])
         self._products.append([*products])
@@ -151,52 +153,56 @@ class AirSums:
         count = rays.sum()
         before = totals[..., 2].sum() / count
         best: tuple[float, int, F64] | None = None
-        for n in range(HIGHEST + 1) if order is None else (order,):
-            some = [
-                k for k, (i, j) in enumerate(powers(HIGHEST)) if i + j <= n and j * _ROWS_A_POWER <= len(self._half)
+        for candidate_order in range(HIGHEST + 1) if order is None else (order,):
+            term_indices = [
+                k
+                for k, (i, j) in enumerate(powers(HIGHEST))
+                if i + j <= candidate_order and j * _ROWS_A_POWER <= len(self._half)
             ]
-            g, b = squares[..., some, :][..., some], products[..., some]
-            if order is None and self._farthest(g.sum(axis=1), some) > _FARTHEST:
+            g, b = squares[..., term_indices, :][..., term_indices], products[..., term_indices]
+            if order is None and self._extrapolation(g.sum(axis=1), term_indices) > _MOST_EXTRAPOLATION:
                 break
             for width in (w for w in _WINDOWS if w <= max(n_views, 1)):
-                wide_g, wide_b = _around(g, width), _around(b, width)
-                c = _solved(wide_g[:, ::-1], wide_b[:, ::-1])  # errors of each half, from the surface of the other half
+                wide_g, wide_b = _sums_around(g, width), _sums_around(b, width)
+                c = _least_squares(
+                    wide_g[:, ::-1], wide_b[:, ::-1]
+                )  # errors of each half, from the surface of the other half
                 residual = np.einsum("...i,...ij,...j", c, g, c) - 2 * np.einsum("...i,...i", c, b) + totals[..., 2]
                 error = float(residual.sum() / count)
-                if best is None or error < best[0] * (_BETTER_WINDOW if n == best[1] else _BETTER_ORDER):
+                if best is None or error < best[0] * (_BETTER_WINDOW if candidate_order == best[1] else _BETTER_ORDER):
                     coefficients = np.zeros((n_views, len(powers(HIGHEST))))
-                    coefficients[:, some] = _solved(wide_g.sum(axis=1), wide_b.sum(axis=1))
-                    best = error, n, coefficients
+                    coefficients[:, term_indices] = _least_squares(wide_g.sum(axis=1), wide_b.sum(axis=1))
+                    best = error, candidate_order, coefficients
         if best is None:
             return None
-        error, n, coefficients = best
+        error, candidate_order, coefficients = best
         terms = self._terms.reshape(-1, self._terms.shape[-1])
         squares = np.einsum("vi,ij,vj", coefficients, terms.T @ terms, coefficients, optimize=True)
         size, mean = float(np.sqrt(squares / (len(terms) * n_views))), terms @ coefficients.mean(axis=0)
         return Background(
-            order=n, coefficients=coefficients, shape=self._shape, size=size, lowest=float(mean.min()),
+            order=candidate_order, coefficients=coefficients, shape=self._shape, size=size, lowest=float(mean.min()),
             highest=float(mean.max()), before=float(before) ** 0.5, after=max(error, 0.0) ** 0.5,
             air=float(share.mean()), level=float(totals[..., 1].sum() / count),
         )  # fmt: skip
 
-    def _farthest(self, squares: F64, some: list[int]) -> float:
+    def _extrapolation(self, squares: F64, term_indices: list[int]) -> float:
         """Largest variance of a surface with these terms in a typical projection, divided by the variance of a
         constant."""
         g = np.median(squares, axis=0)
-        terms = self._terms.reshape(-1, self._terms.shape[-1])[:, some]
+        terms = self._terms.reshape(-1, self._terms.shape[-1])[:, term_indices]
         return float(np.einsum("ri,ij,rj->r", terms, np.linalg.pinv(g, hermitian=True), terms).max() * g[0, 0])
 
     def _without_outliers(self, view: F32, air: Mask) -> Mask:
         """The air mask without rays that deviate from a surface of second order."""
-        t, p = self._terms[air][:, :6], view[air].astype(np.float64)
-        if p.size < 2 * t.shape[1]:
+        terms, values = self._terms[air][:, :6], view[air].astype(np.float64)
+        if values.size < 2 * terms.shape[1]:
             return air
-        residual = view - self._terms[..., :6] @ _solved(t.T @ t, t.T @ p)
+        residual = view - self._terms[..., :6] @ _least_squares(terms.T @ terms, terms.T @ values)
         spread = median_deviation(residual[air])
         return np.asarray(air & (np.abs(residual) <= _CLIPPED * max(spread, 1e-12)))
 
 
-def _around(values: F64, width: int) -> F64:
+def _sums_around(values: F64, width: int) -> F64:
     """Sums over the `width` projections around each projection [view, ...]. At both ends, the sums are over the first,
     or the last, `width` projections."""
     total = np.concatenate((np.zeros_like(values[:1]), np.cumsum(values, axis=0)))
@@ -204,6 +210,6 @@ def _around(values: F64, width: int) -> F64:
     return np.asarray(total[first + width] - total[first])
 
 
-def _solved(squares: F64, products: F64) -> F64:
+def _least_squares(squares: F64, products: F64) -> F64:
     """Least-squares solution [..., term]. Terms that no ray determines are 0."""
     return np.asarray(np.einsum("...ij,...j", np.linalg.pinv(squares, hermitian=True), products))

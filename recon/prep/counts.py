@@ -98,23 +98,26 @@ class Counts:
         """
         dark = np.asarray(self.dark, np.float64)
         flat = np.asarray(self.flat)
-        bright = np.asarray(flat if flat.ndim == 2 else flat[view], np.float64)
+        flat_of_view = np.asarray(flat if flat.ndim == 2 else flat[view], np.float64)
         counted = (np.asarray(np.asarray(self.counts)[view], np.float64) - dark) / self.gain
-        beam = np.maximum((bright - dark) / self.gain, 0.0)
-        extra = np.broadcast_to(np.asarray(self.variance, np.float64) / self.gain**2, counted.shape)
-        return np.maximum(counted, -extra), beam, extra
+        beam = np.maximum((flat_of_view - dark) / self.gain, 0.0)
+        dark_variance = np.broadcast_to(np.asarray(self.variance, np.float64) / self.gain**2, counted.shape)
+        return np.maximum(counted, -dark_variance), beam, dark_variance
 
 
-def expanded(photons: F64, beam: F64, extra: F64, around: F64) -> tuple[F64, F64]:
+def expanded(photons: F64, beam: F64, dark_variance: F64, around: F64) -> tuple[F64, F64]:
     """Line integrals and weights for each pixel. Their weighted squares equal the likelihood to second order.
 
-    With λ = beam e^(-p0) + extra expected at p0 = `around` and n = photons + extra counted, the negative log-likelihood
-    is Σ λ - n ln λ. At p0 the gradient of this function equals the gradient of ½ w (p - p~)², and the curvature of that
-    square is Fisher's information. p~ = p0 - (n - λ) / (λ - extra), w = (λ - extra)² / λ (iteratively reweighted least
-    squares: McCullagh & Nelder 1989, section 2.5). Counts of zero need no special treatment.
+    With λ = beam e^(-p0) + v expected at p0 = `around` and n = photons + v counted, the negative log-likelihood is
+    Σ λ - n ln λ, where v is `dark_variance`. At p0 the gradient of this function equals the gradient of ½ w (p - p~)²,
+    and the curvature of that square is Fisher's information. p~ = p0 - (n - λ) / (λ - v), w = (λ - v)² / λ (iteratively
+    reweighted least squares: McCullagh & Nelder 1989, section 2.5). Counts of zero need no special treatment.
     """
-    seen = beam * np.exp(-around)
-    return around - (photons - seen) / seen, seen * seen / (seen + extra)
+    transmitted = beam * np.exp(-around)
+    return (
+        around - (photons - transmitted) / transmitted,
+        transmitted * transmitted / (transmitted + dark_variance),
+    )
 
 
 def line_integrals(counts: Counts) -> tuple[F32, F32]:
@@ -136,15 +139,17 @@ def line_integrals(counts: Counts) -> tuple[F32, F32]:
     return data, weights
 
 
-def of_view(photons: F64, beam: F64, extra: F64) -> tuple[F64, F64]:
+def of_view(photons: F64, beam: F64, dark_variance: F64) -> tuple[F64, F64]:
     """Line integrals and weights of one projection [row, col], from the images of `Counts.photons`."""
-    good = np.isfinite(photons) & (beam > 0)
-    open_beam = np.where(good, beam, 1.0)
-    level, smooth = _expected(np.where(good, photons, 0), np.where(good, beam, 0), np.where(good, extra, 0))
-    p, _ = expanded(np.where(good, photons, level), open_beam, extra, -np.log(level / open_beam))
+    usable = np.isfinite(photons) & (beam > 0)
+    open_beam = np.where(usable, beam, 1.0)
+    expected, smooth = _expected(
+        np.where(usable, photons, 0), np.where(usable, beam, 0), np.where(usable, dark_variance, 0)
+    )
+    lines, _ = expanded(np.where(usable, photons, expected), open_beam, dark_variance, -np.log(expected / open_beam))
     # Weights that follow the noise of a single ray would hide this noise from methods that whiten with the weights.
-    _, w = expanded(smooth, open_beam, extra, -np.log(smooth / open_beam))
-    return np.where(good, p, np.nan), np.where(good, w, 0)
+    _, weights = expanded(smooth, open_beam, dark_variance, -np.log(smooth / open_beam))
+    return np.where(usable, lines, np.nan), np.where(usable, weights, 0)
 
 
 def photon_transfer(flats: ArrayLike, darks: ArrayLike | None = None) -> tuple[float, float]:
@@ -161,15 +166,15 @@ def photon_transfer(flats: ArrayLike, darks: ArrayLike | None = None) -> tuple[f
     Raises:
         ValueError: there are fewer than two frames, or the variance of the flats does not grow with the intensity.
     """
-    bright, bright_variance = _mean_and_variance(flats, "flats", scaled=True)
+    flat, flat_variance = _mean_and_variance(flats, "flats", scaled=True)
     dark, dark_variance = (
         (np.zeros(1), np.zeros(1)) if darks is None else _mean_and_variance(darks, "darks", scaled=False)
     )
-    signal, noise = bright - dark, bright_variance - dark_variance
-    lit = signal > 0.1 * np.median(signal)
+    signal, noise = flat - dark, flat_variance - dark_variance
+    exposed = signal > 0.1 * np.median(signal)
     # Ratio of sums over the pixels in the beam, without the 1 % with the largest variances (hot pixels).
-    lit &= bright_variance <= np.percentile(bright_variance, 99)
-    gain = float(noise[lit].sum() / signal[lit].sum()) if lit.any() else 0.0
+    exposed &= flat_variance <= np.percentile(flat_variance, 99)
+    gain = float(noise[exposed].sum() / signal[exposed].sum()) if exposed.any() else 0.0
     if not gain > 0:
         raise ValueError(
             "state the gain: it cannot be measured here, because the variance of the flats does not grow with their "
@@ -178,16 +183,16 @@ def photon_transfer(flats: ArrayLike, darks: ArrayLike | None = None) -> tuple[f
     return gain, float(np.median(dark_variance))
 
 
-def _expected(n: F64, beam: F64, extra: F64) -> tuple[F64, F64]:
+def _expected(photons: F64, beam: F64, dark_variance: F64) -> tuple[F64, F64]:
     """Photons expected in each pixel [row, col], above 0. They are the counts, smoothed everywhere or only where they
     show no detail."""
-    mean = _smooth(n, _SIGMA) / np.maximum(_smooth(beam, _SIGMA), 1e-12) * beam
+    mean = _smooth(photons, _SIGMA) / np.maximum(_smooth(beam, _SIGMA), 1e-12) * beam
     # share of the variance of white noise in n - mean: 1 - 2 / 2πσ² + 1 / 4πσ²
     noise_share = 1 - 0.75 / (np.pi * _SIGMA**2)
-    variance = _smooth((n - mean) ** 2, _SPREAD) / noise_share
-    counting = _smooth(n + extra, _SPREAD)
+    variance = _smooth((photons - mean) ** 2, _SPREAD) / noise_share
+    counting = _smooth(photons + dark_variance, _SPREAD)
     detail = np.clip(1 - _DETAIL * counting / np.maximum(variance, 1e-12), 0, 1)
-    return np.maximum(mean + detail * (n - mean), _FEWEST), np.maximum(mean, _FEWEST)
+    return np.maximum(mean + detail * (photons - mean), _FEWEST), np.maximum(mean, _FEWEST)
 
 
 def _smooth(image: F64, sigma: float) -> F64:

@@ -21,7 +21,7 @@ from recon.prep.projections import Projections
 from recon.prep.references import (
     References,
     air_columns,
-    air_light,
+    air_transmission,
     check,
     dead_pixels,
     edge_depth,
@@ -98,7 +98,7 @@ class CorrectionPlan:
             `counts.line_integrals`. None: line integrals are logarithms.
         foreign: bool [row], rows in which dark pixels do not show the sample, see `unmeasured`. None: there are no such
             rows.
-        light: float64 [frame of the scan], factor on the intensity of each projection; None: 1 for all.
+        intensity_factors: float64 [frame of the scan], factor on the intensity of each projection; None: 1 for all.
         spots: state of the zinger filter after the projections so far.
         profiles: for each batch of projections so far, the `edge_profiles` and the numbers int64 [view] of its
             projections.
@@ -115,7 +115,7 @@ class CorrectionPlan:
     spots: SpotFilter
     photons: Photons | None = None
     foreign: Mask | None = None
-    light: F64 | None = None
+    intensity_factors: F64 | None = None
     profiles: tuple[tuple[F32, I64], ...] = ()
 
     @cached_property
@@ -164,32 +164,32 @@ class CorrectionPlan:
             if beam is not None and self.photons is not None:
                 np.divide(flat, np.float32(self.photons.gain), out=beam[v])
                 fill(beam[v], self.filling)
-            bad = ~np.isfinite(view) & ~self.masked
-            repaired[v] = bad.sum()
+            not_finite = ~np.isfinite(view) & ~self.masked
+            repaired[v] = not_finite.sum()
             if repaired[v] > view.size / 2:
                 raise ValueError(
                     f"leave out projection {view_ids[v]}: {repaired[v]} of its {view.size} pixels are not finite"
                 )
             if (unseen := unmeasured(counts[v], view, self.hidden, self.foreign)) is not None:
                 runs.append(runs_of(unseen, int(view_ids[v])))
-                repaired[v] -= np.count_nonzero(bad & unseen)
-                bad |= unseen
-            fill(view, plan_fill(bad | self.masked) if repaired[v] or unseen is not None else self.filling)
+                repaired[v] -= np.count_nonzero(not_finite & unseen)
+                not_finite |= unseen
+            fill(view, plan_fill(not_finite | self.masked) if repaired[v] or unseen is not None else self.filling)
             progress(v + 1)
-        if self.light is not None:
-            light = self.light[view_ids].astype(np.float32)[:, None, None]
-            np.multiply(data, light, out=data)
+        if self.intensity_factors is not None:
+            factors = self.intensity_factors[view_ids].astype(np.float32)[:, None, None]
+            np.multiply(data, factors, out=data)
             if beam is not None:
-                np.divide(beam, light, out=beam)
+                np.divide(beam, factors, out=beam)
         return Transmission(data, view_ids, repaired, np.ones(len(data), np.float32), beam, np.concatenate(runs))
 
     def _flat_of(self, view: Image, position: float) -> Image:
         """Flat minus dark [row, col] for a projection; 1 in masked pixels."""
-        between = flat_at(position, self.flats, self.part_starts)
+        interpolated = flat_at(position, self.flats, self.part_starts)
         if self.dynamic is None:
-            return between
-        live = ~self.masked
-        level = between[live].mean() / self.dynamic.mean[live].mean()
+            return interpolated
+        unmasked = ~self.masked
+        level = interpolated[unmasked].mean() / self.dynamic.mean[unmasked].mean()
         return np.where(self.masked, np.float32(1), level * self.dynamic.flat_of(view / level, self.settings.floor))
 
     def surveyed(self, views: Transmission) -> CorrectionPlan:
@@ -228,21 +228,22 @@ class CorrectionPlan:
             floored += int((low & ~self.masked).sum())
             view[low] = settings.floor
             np.negative(np.log(view, out=view), out=view)
-        live = max(int((~self.masked).sum()) * len(views.data), 1)
-        replaced = int(views.repaired.sum()) / live
+        n_unmasked = max(int((~self.masked).sum()) * len(views.data), 1)
+        replaced = int(views.repaired.sum()) / n_unmasked
         return Projections(
-            views.data, views.view_ids, floored / live, views.air, self.masked, columns, replaced, views.beam,
-            views.unmeasured, spots.left,
+            views.data, views.view_ids, floored / n_unmasked, views.air, self.masked, columns, replaced, views.beam,
+            views.unmeasured, spots.n_unfilled,
         ), replace(self, spots=spots)  # fmt: skip
 
     def _levelled(self, views: Transmission) -> Transmission:
         """Divide the projections by the level of their air columns, in place."""
-        level, columns = air_light(views.data, *self.air_columns), self.air_columns
-        unlit = views.view_ids[~(level.min(axis=1) > self.settings.floor)]
-        if unlit.size:
+        level, columns = air_transmission(views.data, *self.air_columns), self.air_columns
+        without_beam = views.view_ids[~(level.min(axis=1) > self.settings.floor)]
+        if without_beam.size:
             raise UnlitViewsError(
-                f"leave out the projections without beam: {unlit.size} of {len(level)} ({unlit[:8].tolist()} ...). "
-                f"Their air columns, {columns[0]} on the left and {columns[1]} on the right, are dark"
+                f"leave out the projections without beam: {without_beam.size} of {len(level)} "
+                f"({without_beam[:8].tolist()} ...). Their air columns, {columns[0]} on the left and {columns[1]} on "
+                "the right, are dark"
             )
         views.data[...] /= level[:, None]
         beam = None if views.beam is None else views.beam * level[:, None]
@@ -253,29 +254,29 @@ class CorrectionPlan:
         weights."""
         assert self.photons is not None
         open_beam = beam.astype(np.float64)
-        extra = np.full(view.shape, self.photons.variance / self.photons.gain**2)
-        p, w = of_view(np.maximum(view * open_beam, -extra), open_beam, extra)
-        view[...] = np.where(w > 0, p, 0)
-        beam[...] = np.where(self.masked, 0, w)
+        dark_variance = np.full(view.shape, self.photons.variance / self.photons.gain**2)
+        lines, weights = of_view(np.maximum(view * open_beam, -dark_variance), open_beam, dark_variance)
+        view[...] = np.where(weights > 0, lines, 0)
+        beam[...] = np.where(self.masked, 0, weights)
 
 
 def survey(
     references: References,
     settings: CorrectionSettings | None = None,
     masked: Mask | None = None,
-    standing: Mask | None = None,
+    shadow: Mask | None = None,
     photons: Photons | None = None,
     foreign: Mask | None = None,
-    light: F64 | None = None,
+    intensity_factors: F64 | None = None,
 ) -> CorrectionPlan:
     """The correction plan for these flats and darks.
 
     Args:
         references: darks and flats of the same detector area as the projections.
         masked: bool [row, col], pixels to fill; None: `dead_pixels` of the darks and flats.
-        standing: bool [row, col], further pixels to fill, which are in the shadow of a fixed object; None: there are
+        shadow: bool [row, col], further pixels to fill, which are in the shadow of a fixed object; None: there are
             none.
-        photons, foreign, light: those of the plan.
+        photons, foreign, intensity_factors: those of the plan.
 
     Raises:
         ValueError: shapes do not match, there are no flats, or the flats show no beam.
@@ -290,16 +291,17 @@ def survey(
         raise ValueError(f"masked must have shape {dark.shape}, got {np.shape(masked)}")
     if masked is None:
         masked = dead_pixels(dark, [flat for _, flat in references.flats], settings.hot_threshold)
-    masked = masked if standing is None else masked | standing
+    masked = masked if shadow is None else masked | shadow
     with np.errstate(invalid="ignore", over="ignore"):
         flats = tuple(
             (position, np.where(masked, np.float32(1), np.asarray(flat, np.float32) - dark))
             for position, flat in sorted(references.flats, key=lambda group: group[0])
         )
-    spots = SpotFilter(settings.zinger_threshold, lambda light: np.sqrt(np.maximum(light, 0)))
+    spots = SpotFilter(settings.zinger_threshold, lambda transmission: np.sqrt(np.maximum(transmission, 0)))
     starts, hidden, filling = references.part_starts, areas(masked), plan_fill(masked)
     return CorrectionPlan(
-        settings, dark, flats, starts, references.dynamic, masked, hidden, filling, spots, photons, foreign, light
+        settings, dark, flats, starts, references.dynamic, masked, hidden, filling, spots, photons, foreign,
+        intensity_factors,
     )  # fmt: skip
 
 

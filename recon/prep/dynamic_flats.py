@@ -28,7 +28,7 @@ _ROUNDS = 20  # number of rounds of reweighting
 _SMOOTHED = 5  # pixels per side of the smoothing that is used to detect air
 # percentile of the line integrals that shows air; range of line integrals in air, and smallest share of air
 _LOWEST, _AIR, _ENOUGH = 5.0, 0.04, 0.1
-_MOST_LEFT = 3.0  # multiple of the noise; with material, the residual is larger
+_MOST_RESIDUAL = 3.0  # multiple of the noise; with material, the residual is larger
 _DARKEST = 0.05  # share of the median flat; darker pixels are not used
 
 
@@ -51,8 +51,8 @@ class DynamicFlats:
 
     def flat_of(self, view: F32, floor: float = 1e-4) -> F32:
         """The flat [row, col] (minus dark) for this projection. Its level is that of the mean flat."""
-        w = self.weights_of(view, floor)
-        return np.asarray(self.mean * np.exp(np.tensordot(w, self.components, axes=1)), np.float32)
+        weights = self.weights_of(view, floor)
+        return np.asarray(self.mean * np.exp(np.tensordot(weights, self.components, axes=1)), np.float32)
 
     def weights_of(self, view: F32, floor: float = 1e-4) -> F32:
         """Weights [component] of this projection. With these weights, the sum of absolute differences of line integrals
@@ -68,29 +68,29 @@ class DynamicFlats:
             return np.zeros(len(self.components), np.float32)
         integral = -np.log(np.where(known, transmission, 1.0))
         # the noise of a line integral is proportional to the inverse of this
-        share = np.sqrt(np.where(known, transmission, 0))
+        root_transmission = np.sqrt(np.where(known, transmission, 0))
         targets, columns = [], []
         for axis in [axis for axis, size in enumerate(view.shape) if size > 1]:
-            apart = min(_APART, view.shape[axis] - 1)
-            first, second = _shifted(axis, apart)
+            distance = min(_APART, view.shape[axis] - 1)
+            first, second = _pixel_pairs(axis, distance)
             step = max(1, 2 * view.size // _SAMPLED)
-            weight = np.minimum(share[first], share[second])
+            weight = np.minimum(root_transmission[first], root_transmission[second])
             change = (self.components[:, *second] - self.components[:, *first]) * weight
             columns.append(change.reshape(len(self.components), -1)[:, ::step])
             targets.append(((integral[first] - integral[second]) * weight).ravel()[::step])
-        w = _least_absolute(np.concatenate(columns, axis=1).T, np.concatenate(targets))
-        return self._by_air(w, integral, known).astype(np.float32)
+        weights = _least_absolute(np.concatenate(columns, axis=1).T, np.concatenate(targets))
+        return self._fitted_in_air(weights, integral, known).astype(np.float32)
 
-    def _by_air(self, w: F64, integral: F32, known: NDArray[np.bool_]) -> F64:
-        """The weights fitted on the pixels in air; `w` if there are too few such pixels, or if they do not match the
-        fit."""
-        weights: NDArray[Any] = w
+    def _fitted_in_air(self, fitted_weights: F64, integral: F32, known: NDArray[np.bool_]) -> F64:
+        """The weights fitted on the pixels in air; `fitted_weights` if there are too few such pixels, or if they do
+        not match the fit."""
+        weights: NDArray[Any] = fitted_weights
         for _ in range(2):
             residual = integral + np.tensordot(weights, self.components, axes=1)
             smooth = scipy.ndimage.uniform_filter(residual, _SMOOTHED, mode="nearest")
             air = known & (np.abs(smooth - np.percentile(smooth[known], _LOWEST)) < _AIR)
             if air.mean() < _ENOUGH:
-                return w
+                return fitted_weights
             pixels = np.flatnonzero(air)[:: max(1, int(air.sum()) // _SAMPLED)]
             matrix = np.column_stack(
                 (self.components.reshape(len(self.components), -1)[:, pixels].T, np.ones(pixels.size))
@@ -102,7 +102,7 @@ class DynamicFlats:
         residual = integral + np.tensordot(weights, self.components, axes=1) + np.float32(level)
         smooth = scipy.ndimage.uniform_filter(residual, _SMOOTHED, mode="nearest")
         noise = float(np.median(np.abs(residual - smooth)[air])) / _SMOOTHED
-        return weights if float(np.median(np.abs(smooth[air]))) < _MOST_LEFT * noise else w
+        return weights if float(np.median(np.abs(smooth[air]))) < _MOST_RESIDUAL * noise else fitted_weights
 
 
 def find_dynamic_flats(
@@ -123,19 +123,19 @@ def find_dynamic_flats(
     if n < _FEWEST:
         raise ValueError(f"dynamic flats need at least {_FEWEST} flats, got {n}")
     mean = np.asarray(total / n, np.float32)
-    good = mean > _DARKEST * np.median(mean)
+    usable = mean > _DARKEST * np.median(mean)
     if masked is not None:
-        good &= ~masked
-    some = np.flatnonzero(good)[:: max(1, int(good.sum()) // _SAMPLED)]
-    samples = np.stack([_shape(flat, mean, good).ravel()[some] for flat in flats()]).astype(np.float64)
+        usable &= ~masked
+    sampled = np.flatnonzero(usable)[:: max(1, int(usable.sum()) // _SAMPLED)]
+    samples = np.stack([_log_ratio(flat, mean, usable).ravel()[sampled] for flat in flats()]).astype(np.float64)
     loadings = _components(samples - samples.mean(axis=0), rng)
     components = np.zeros((len(loadings), *mean.shape), np.float32)
     for i, flat in enumerate(flats()):
-        shape = _shape(flat, mean, good)
-        for component, share in zip(components, loadings[:, i], strict=True):
-            component += np.float32(share) * shape
+        log_ratio = _log_ratio(flat, mean, usable)
+        for component, loading in zip(components, loadings[:, i], strict=True):
+            component += np.float32(loading) * log_ratio
     for component in components:
-        component /= np.sqrt(np.mean(component[good] ** 2))
+        component /= np.sqrt(np.mean(component[usable] ** 2))
     return DynamicFlats(mean, components)
 
 
@@ -150,11 +150,11 @@ def view_memory(flats: int, pixels: int) -> int:
     return 4 * pixels * (4 * components + 14) + 8 * samples * (3 * components + 8)
 
 
-def _shape(flat: F32, mean: F32, good: NDArray[np.bool_]) -> F32:
+def _log_ratio(flat: F32, mean: F32, usable: NDArray[np.bool_]) -> F32:
     """The logarithm of a flat divided by the mean flat, minus its level; 0 in unused pixels."""
-    ratio = np.divide(flat, mean, out=np.ones_like(mean), where=good & (flat > 0))
-    shape = np.log(ratio)
-    return np.asarray(np.where(good, shape - shape[good].mean(), 0), np.float32)
+    ratio = np.divide(flat, mean, out=np.ones_like(mean), where=usable & (flat > 0))
+    log_ratio = np.log(ratio)
+    return np.asarray(np.where(usable, log_ratio - log_ratio[usable].mean(), 0), np.float32)
 
 
 def _components(samples: F64, rng: np.random.Generator) -> F64:
@@ -162,14 +162,14 @@ def _components(samples: F64, rng: np.random.Generator) -> F64:
     analysis)."""
     values, vectors = np.linalg.eigh(samples @ samples.T)
     deviation = samples.std(axis=0, ddof=1)
-    drawn = []
+    noise_eigenvalues = []
     for _ in range(_RANDOM):
         noise = rng.standard_normal(samples.shape) * deviation
         noise -= noise.mean(axis=0)
-        drawn.append(np.linalg.eigvalsh(noise @ noise.T))
-    limit = np.mean(drawn, axis=0) + 2 * np.std(drawn, axis=0)
-    stands_out = (values > limit)[::-1]
-    number = int(np.argmin(np.append(stands_out, False)))
+        noise_eigenvalues.append(np.linalg.eigvalsh(noise @ noise.T))
+    limit = np.mean(noise_eigenvalues, axis=0) + 2 * np.std(noise_eigenvalues, axis=0)
+    above_noise = (values > limit)[::-1]
+    number = int(np.argmin(np.append(above_noise, False)))
     return vectors[:, ::-1].T[: min(number, _MOST)]
 
 
@@ -181,14 +181,14 @@ def _least_absolute(matrix: F64 | F32, target: F64 | F32) -> F64:
     for _ in range(_ROUNDS):
         weighted = matrix * weight[:, None]
         x = np.linalg.lstsq(weighted.T @ matrix, weighted.T @ target, rcond=None)[0]
-        off = np.abs(target - matrix @ x)
-        weight = 1 / np.maximum(off, 1e-3 * max(float(np.median(off)), 1e-12))
+        deviations = np.abs(target - matrix @ x)
+        weight = 1 / np.maximum(deviations, 1e-3 * max(float(np.median(deviations)), 1e-12))
     return x
 
 
-def _shifted(axis: int, apart: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+def _pixel_pairs(axis: int, distance: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
     """Slices of the first and the second pixel of each pair along an axis."""
     whole = (slice(None), slice(None))
     first, second = list(whole), list(whole)
-    first[axis], second[axis] = slice(None, -apart), slice(apart, None)
+    first[axis], second[axis] = slice(None, -distance), slice(distance, None)
     return tuple(first), tuple(second)

@@ -32,16 +32,16 @@ def fans_shown(sinogram: F64, angles: F64, axis_col: float, slope: float) -> tup
     cols = sinogram.shape[1] // factor
     rows = sinogram[order, : cols * factor].reshape(order.size, cols, factor).mean(axis=2)
     beta, u = np.mod(angles[order], 2 * math.pi), (np.arange(cols) + 0.5) * factor - 0.5 - axis_col
-    seen = np.abs(u) <= min(-u[0], u[-1])
-    u, rows = u[seen], rows[:, seen]
+    seen_from_both_sides = np.abs(u) <= min(-u[0], u[-1])
+    u, rows = u[seen_from_both_sides], rows[:, seen_from_both_sides]
     mirrored = np.stack([np.interp(-u, u, row) for row in rows])
 
     def disagreement(slope: float) -> float:
         turns = math.pi - 2 * np.arctan(slope * u)
-        there = [
+        opposite_rays = [
             np.interp(beta + turn, beta, row, period=2 * math.pi) for turn, row in zip(turns, mirrored.T, strict=True)
         ]
-        return float(np.square(rows - np.stack(there, axis=1)).mean() / (2 * rows.var()))
+        return float(np.square(rows - np.stack(opposite_rays, axis=1)).mean() / (2 * rows.var()))
 
     slopes = np.tan(np.arange(0, _WIDEST, _STEP)) / u[-1]
     mismatches = [disagreement(each) for each in slopes]

@@ -52,21 +52,23 @@ class LinesPlan:
         """The line integrals. A pixel without data, or with a value that is not finite, gets the value of the nearest
         pixel with data."""
         data = lines.astype(np.float32, copy=False)
-        bad, runs, repaired = ~np.isfinite(data), [NO_RUNS], np.zeros(len(data), np.int64)
+        not_finite, runs, repaired = ~np.isfinite(data), [NO_RUNS], np.zeros(len(data), np.int64)
         hidden = np.zeros(data.shape[1:], np.bool_)
         for v, view in enumerate(data):
             values = np.exp(-np.clip(view, -_DEEPEST, _DEEPEST))
             values[(view == 0) & (np.mean(view < 0) > _NOISY)] = 0
-            lost = bad[v]
+            without_data = not_finite[v]
             if (unseen := unmeasured(view, values, hidden, self.foreign)) is not None:
                 runs.append(runs_of(unseen, int(view_ids[v])))
-                lost, repaired[v] = lost | unseen, -np.count_nonzero(lost & unseen)
-            repaired[v] += np.count_nonzero(bad[v])
-            if lost.any():
-                nearest = ndimage.distance_transform_edt(lost, return_distances=False, return_indices=True)
+                without_data, repaired[v] = without_data | unseen, -np.count_nonzero(without_data & unseen)
+            repaired[v] += np.count_nonzero(not_finite[v])
+            if without_data.any():
+                nearest = ndimage.distance_transform_edt(without_data, return_distances=False, return_indices=True)
                 view[...] = view[tuple(nearest)]
         ones = np.ones(len(data), np.float32)
-        return Transmission(data, view_ids, repaired, ones, None, np.concatenate(runs), bad.min(axis=0, initial=True))
+        return Transmission(
+            data, view_ids, repaired, ones, None, np.concatenate(runs), not_finite.min(axis=0, initial=True)
+        )
 
     def surveyed(self, views: Transmission) -> LinesPlan:
         """The plan after these projections: a pixel stays masked only if it has no data in these projections either."""
@@ -84,5 +86,5 @@ class LinesPlan:
         replaced = float(views.repaired.sum()) / max(views.data.size, 1)
         return Projections(
             views.data, views.view_ids, 0.0, views.air, self.masked, replaced=replaced, unmeasured=views.unmeasured,
-            spots_left=spots.left,
+            spots_left=spots.n_unfilled,
         ), replace(self, spots=spots)  # fmt: skip

@@ -130,9 +130,11 @@ def absorbed_dose(name: str, energy_kev: float, photons_per_mm2: float) -> float
     """
     if not 1.0 <= energy_kev <= 200.0:
         raise ValueError(f"doses are tabulated from 1 to 200 keV, got {energy_kev:g} keV")
-    kept = energy_kev / (_ELECTRON_KEV + 2.1 * energy_kev)  # mean share of a Compton electron, to 2 % (Klein-Nishina)
+    electron_share = energy_kev / (
+        _ELECTRON_KEV + 2.1 * energy_kev
+    )  # mean share of a Compton electron, to 2 % (Klein-Nishina)
     absorbed = sum(  # cm²/g
-        share * (xraylib.CS_Photo(z, energy_kev) + kept * xraylib.CS_Compt(z, energy_kev))
+        share * (xraylib.CS_Photo(z, energy_kev) + electron_share * xraylib.CS_Compt(z, energy_kev))
         for z, share in _fractions(name).items()
     )
     return float(photons_per_mm2 * 1e2 * energy_kev * _JOULE_PER_KEV * absorbed * 1e3)
@@ -153,18 +155,18 @@ def tube_spectrum(kv: float, filters: Mapping[str, float]) -> tuple[F64, F64]:
     """
     if not 5 <= kv <= 800:
         raise ValueError(f"the tube voltage must be 5 to 800 kV, got {kv} kV")
-    x, w = _gauss_rule()
-    energies = _SOFTEST_KEV + (kv - _SOFTEST_KEV) * (x + 1) / 2
+    nodes, node_weights = _gauss_rule()
+    energies = _SOFTEST_KEV + (kv - _SOFTEST_KEV) * (nodes + 1) / 2
     depth = np.zeros(_NODES)
     for name, mm in filters.items():
         if name not in KNOWN:
             raise ValueError(f"the density of the filter {name!r} is unknown; use one of {', '.join(KNOWN)}")
         depth += 0.1 * mm * KNOWN[name][0] * mass_attenuation(name, energies)
-    weights = w * (kv - energies) / energies * np.exp(-depth)
+    weights = node_weights * (kv - energies) / energies * np.exp(-depth)
     if not weights.any():
         raise ValueError(f"no X-rays of the tube at {kv:g} kV pass its filters {dict(filters)} (thickness in mm)")
-    kept = weights > _NOTHING * weights.sum()
-    return energies[kept], weights[kept]
+    significant = weights > _NOTHING * weights.sum()
+    return energies[significant], weights[significant]
 
 
 @cache  # takes half a second

@@ -56,17 +56,21 @@ class Overshoot:
         Edges are searched in every second row and measured in the rows between. So noise, or a ring, cannot select
         which pixels are measured. Edges in the same column and rows count once.
         """
-        most, some = cls(), spread(np.arange(len(views)), MOST_VIEWS)
+        most_significant, examined_views = cls(), spread(np.arange(len(views)), MOST_VIEWS)
         for n in _LEVELS:
             blocks = spread(np.arange(views.shape[1] // (2 * n)), _BLOCKS)
             if blocks.size and views.shape[2] >= 4 * _AIR:
                 rows = (blocks[:, None] * 2 * n + np.arange(2 * n)).ravel()
-                halves = np.stack([views[view][rows].reshape(-1, n, 2, views.shape[2]).mean(axis=1) for view in some])
+                halves = np.stack(
+                    [views[view][rows].reshape(-1, n, 2, views.shape[2]).mean(axis=1) for view in examined_views]
+                )
                 averaged = np.stack(
                     [each.mean(axis=0) for each in np.array_split(halves, -(-len(halves) // _AVERAGED))]
                 )
-                most = max(most, _overshoot(halves), _overshoot(averaged), key=lambda each: each.errors)
-        return most
+                most_significant = max(
+                    most_significant, _overshoot(halves), _overshoot(averaged), key=lambda each: each.errors
+                )
+        return most_significant
 
     @classmethod
     def of_counts(cls, counts: F32, dark: F32 | float, flat: F32 | float) -> Overshoot:
@@ -86,23 +90,31 @@ class Overshoot:
 def _overshoot(halves: F32) -> Overshoot:
     """Overshoot of line integrals [view, block, half of the rows, col]."""
     edges = [
-        _edges(halves[:, :, half, ::way], halves[:, :, 1 - half, ::way], 2 * half + (way > 0))
+        _edges(halves[:, :, half, ::direction], halves[:, :, 1 - half, ::direction], 2 * half + (direction > 0))
         for half in (0, 1)
-        for way in (1, -1)
+        for direction in (1, -1)
     ]
-    rays, place = (np.concatenate(parts) for parts in zip(*edges, strict=True))
-    group = np.unique(place, return_inverse=True)[1]
-    places = int(group.max(initial=-1)) + 1
-    if places < _FEWEST:
+    rays, position = (np.concatenate(parts) for parts in zip(*edges, strict=True))
+    position_index = np.unique(position, return_inverse=True)[1]
+    n_positions = int(position_index.max(initial=-1)) + 1
+    if n_positions < _FEWEST:
         return Overshoot()
     below = rays[:, 1 + _BESIDE :].mean(axis=1, dtype=np.float64)[:, None] - rays
     mean = below.mean(axis=0)
-    scatter = np.square([np.bincount(group, column) for column in (below - mean).T]).sum(axis=1) * places / (places - 1)
+    scatter = (
+        np.square([np.bincount(position_index, column) for column in (below - mean).T]).sum(axis=1)
+        * n_positions
+        / (n_positions - 1)
+    )
     errors = np.sqrt(scatter[1 : 1 + _BESIDE]) / len(below) + 1e-9
     noise = np.sqrt(2 * scatter[1 + _BESIDE :].mean()) / len(below) + 1e-9  # compared with the mean of three columns
-    by_noise = np.where(mean[1 : 1 + _BESIDE] > _AGREE * errors, mean[1 : 1 + _BESIDE] / noise, 0)
-    k = int(by_noise.argmax())
-    return Overshoot(float(mean[1 + k] / -mean[0]), float(by_noise[k])) if mean[0] < 0 < by_noise[k] else Overshoot()
+    significance = np.where(mean[1 : 1 + _BESIDE] > _AGREE * errors, mean[1 : 1 + _BESIDE] / noise, 0)
+    k = int(significance.argmax())
+    return (
+        Overshoot(float(mean[1 + k] / -mean[0]), float(significance[k]))
+        if mean[0] < 0 < significance[k]
+        else Overshoot()
+    )
 
 
 def _edges(sought: F32, measured: F32, kind: int) -> tuple[F32, I64]:

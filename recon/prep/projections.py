@@ -74,17 +74,17 @@ def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None =
             then ignored.
     """
     n = np.array([part.view_ids.size for part in parts], np.float64)
-    weights, last = n / max(n.sum(), 1), parts[-1]
+    shares, last = n / max(n.sum(), 1), parts[-1]
     ids, air, runs = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("view_ids", "air", "unmeasured")
     )
-    floored, replaced = (float(weights @ [getattr(part, name) for part in parts]) for name in ("floored", "replaced"))
-    each = [part.weights for part in parts if part.weights is not None]
-    counted = np.concatenate(each) if each else None
+    floored, replaced = (float(shares @ [getattr(part, name) for part in parts]) for name in ("floored", "replaced"))
+    weights_of_parts = [part.weights for part in parts if part.weights is not None]
+    weights = np.concatenate(weights_of_parts) if weights_of_parts else None
     if data is None:
         data, start = np.empty((len(ids), *last.data.shape[1:]), np.float32), 0
         while parts:
             part = parts.pop(0).data
             data[start : start + len(part)] = part
             start += len(part)
-    return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted, runs, last.spots_left)
+    return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, weights, runs, last.spots_left)

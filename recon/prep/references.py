@@ -20,7 +20,7 @@ from recon.prep.dynamic_flats import DynamicFlats
 from recon.prep.spots import without_spots
 from recon.prep.unmeasured import with_rim
 
-Kept = TypeVar("Kept", F32, F64)
+DarkImage = TypeVar("DarkImage", F32, F64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +46,8 @@ class References:
     part_starts: tuple[int, ...] = (0,)
 
     def __post_init__(self) -> None:
-        some = np.ma.filled(self.flats[0][1], 0) if isinstance(self.flats, tuple) and self.flats else np.zeros(0)
-        beam = float(np.nanpercentile(some, _BRIGHT)) if np.size(some) else 0.0
+        flat_values = np.ma.filled(self.flats[0][1], 0) if isinstance(self.flats, tuple) and self.flats else np.zeros(0)
+        beam = float(np.nanpercentile(flat_values, _BRIGHT)) if np.size(flat_values) else 0.0
         object.__setattr__(self, "dark", _mean(self.dark, "darks", beam))
         check_settings(self)
         flats = tuple((position, _mean(flat, f"flats at {position:g}", beam)) for position, flat in self.flats)
@@ -90,26 +90,26 @@ def check(references: References) -> None:
         )
 
 
-def dark_at(exposure: float, darks: Sequence[tuple[float, Kept]]) -> Kept:
+def dark_at(exposure: float, darks: Sequence[tuple[float, DarkImage]]) -> DarkImage:
     """The dark for an exposure time in s. A dark is linear in the exposure time, so two darks determine all others.
 
     Args:
         darks: one or more pairs (exposure time in s, image [row, col]) with different exposure times.
     """
-    near = sorted(darks, key=lambda dark: abs(dark[0] - exposure))
-    (first, image), *others = near
+    by_distance = sorted(darks, key=lambda dark: abs(dark[0] - exposure))
+    (first, first_image), *others = by_distance
     if not others or first == exposure:
-        return image
-    second, other = others[0]
-    return image + (exposure - first) / (second - first) * (other - image)
+        return first_image
+    second, second_image = others[0]
+    return first_image + (exposure - first) / (second - first) * (second_image - first_image)
 
 
 def flat_at(position: float, groups: Sequence[tuple[float, Image]], part_starts: tuple[int, ...]) -> Image:
     """Flat minus dark at the position of a frame: interpolated between the two groups of its part around the frame;
     without two such groups, that of the nearest group."""
     part = bisect_right(part_starts, position)
-    own = [group for group in groups if bisect_right(part_starts, group[0]) == part]
-    groups = own or [min(groups, key=lambda group: abs(group[0] - position))]
+    of_part = [group for group in groups if bisect_right(part_starts, group[0]) == part]
+    groups = of_part or [min(groups, key=lambda group: abs(group[0] - position))]
     positions = [p for p, _ in groups]
     upper = int(np.searchsorted(positions, position))
     if upper == 0 or upper == len(groups):
@@ -170,21 +170,21 @@ def shadowed(transmission: NDArray[np.float32], floor: float = 1e-4) -> Mask:
     see `with_rim`.
 
     Args:
-        light: float32 [view, row, col], transmission of at least three projections from all directions.
+        transmission: float32 [view, row, col], of at least three projections from all directions.
         floor: lowest transmission that counts as beam.
     """
     n = len(transmission)
     middle = np.median(transmission, axis=0)
-    spread = np.median(np.abs(transmission - middle), axis=0) / MEDIAN
-    dark = middle < np.maximum(floor, _SURE * spread / np.sqrt(n))
-    bright = np.partition(transmission, n - 2, axis=0)[n - 2]  # a single projection may have a zinger
-    dark &= bright < _DIM
-    whole = dark.mean(axis=1) > _WHOLE  # rows that the camera does not read have no blurred edge
+    deviation = np.median(np.abs(transmission - middle), axis=0) / MEDIAN
+    dark = middle < np.maximum(floor, _SURE * deviation / np.sqrt(n))
+    second_brightest = np.partition(transmission, n - 2, axis=0)[n - 2]  # a single projection may have a zinger
+    dark &= second_brightest < _DIM
+    dark_rows = dark.mean(axis=1) > _WHOLE  # rows that the camera does not read have no blurred edge
     block = np.ones((3, 3))
     dark = ndimage.binary_opening(ndimage.binary_closing(np.pad(dark, 2, mode="edge"), block), block)[2:-2, 2:-2]
     left, right = (np.logical_and.accumulate(side, axis=1) for side in (dark, dark[:, ::-1]))
     shadow = left | right[:, ::-1]
-    return with_rim(shadow, bright) | whole[:, None]
+    return with_rim(shadow, second_brightest) | dark_rows[:, None]
 
 
 _NEXT, _OUTER = 5, 3  # number of projections next to flats; number of columns
@@ -217,7 +217,7 @@ def air_columns(profiles: F32, cols: int, tolerance: float = 0.03) -> tuple[int,
     the other side by more than 10 %. `profiles` are the `edge_profiles` of all projections.
     """
     least = max(3, cols // 25)
-    counts, levels = [], []
+    n_columns, levels = [], []
     for profile in (profiles[:, 0], profiles[:, 1]):
         level = np.median(profile[:, :, :3], axis=(1, 2))
         relative = profile / np.where(level > 0, level, 1e-30)[:, None, None] - 1
@@ -228,9 +228,9 @@ def air_columns(profiles: F32, cols: int, tolerance: float = 0.03) -> tuple[int,
         n = int(np.argmin(np.append(steady, False)))
         n -= n // 4  # keep a distance from the sample's edge and its phase fringes
         trend = np.median(relative[:, :, n // 2 : n]) - np.median(relative[:, :, : n // 2]) if n > 1 else -np.inf
-        counts.append(n if n >= least and trend > -tolerance / 2 else 0)
+        n_columns.append(n if n >= least and trend > -tolerance / 2 else 0)
         levels.append(float(np.median(level)))
-    left, right = (n if level > 0.9 * max(levels) else 0 for n, level in zip(counts, levels, strict=True))
+    left, right = (n if level > 0.9 * max(levels) else 0 for n, level in zip(n_columns, levels, strict=True))
     return left, right
 
 
@@ -250,14 +250,14 @@ def edge_depth(profiles: F32, positions: NDArray[np.int64], flats: Sequence[floa
     """
     sides = [side for side, n in enumerate(columns) if n]
     levels = np.median(profiles[:, sides, :, :_OUTER], axis=(1, 2, 3))
-    beside = (np.argsort(np.abs(positions - flat), kind="stable")[:_NEXT] for flat in flats)
-    depth = min(-math.log(max(float(np.median(levels[views])), 1e-30)) for views in beside)
+    views_near_flats = (np.argsort(np.abs(positions - flat), kind="stable")[:_NEXT] for flat in flats)
+    depth = min(-math.log(max(float(np.median(levels[views])), 1e-30)) for views in views_near_flats)
     outer, inner = (np.median(part, axis=(0, 2, 3)) for part in (profiles[..., :_OUTER], profiles[..., -_OUTER:]))
     rises = np.log(np.maximum(outer, 1e-30) / np.maximum(inner, 1e-30))[sides]
     return depth if rises.min() > _RISE else 0.0
 
 
-def air_light(transmission: F32, left: int, right: int) -> F32:
+def air_transmission(transmission: F32, left: int, right: int) -> F32:
     """Transmission of the air across each projection [view, col], computed from its air columns; 1 if there are no air
     columns.
 
@@ -274,5 +274,5 @@ def air_light(transmission: F32, left: int, right: int) -> F32:
     if len(sides) == 1:
         return np.repeat(levels[0][:, None], cols, axis=1)
     first, last = (middle for _, middle in sides)
-    along = np.clip((np.arange(cols) - first) / (last - first), 0, 1).astype(np.float32)
-    return levels[0][:, None] * (1 - along) + levels[1][:, None] * along
+    right_weight = np.clip((np.arange(cols) - first) / (last - first), 0, 1).astype(np.float32)
+    return levels[0][:, None] * (1 - right_weight) + levels[1][:, None] * right_weight

@@ -53,19 +53,22 @@ def changes_seen(data: F32, geometry: Geometry) -> Iterator[tuple[tuple[int, int
     noise = noise_level(bin_views(data[spread(np.arange(len(data)), NOISE_VIEWS)], side))
     for pairs in _pairs(geometry, data.shape[2] / side / 2):
         sums = [part for pair in pairs for part in _sums(data, geometry, pair, side)]
-        normal, right, squares, structure, sizes = (np.stack(each) for each in zip(*sums, strict=True))
-        total, of_all = normal.sum(axis=0), right.sum(axis=0)
+        normal, right_sides, squares, structure, sizes = (np.stack(each) for each in zip(*sums, strict=True))
+        total_normal, total_right = normal.sum(axis=0), right_sides.sum(axis=0)
         too_noisy = noise**2 / (2 * np.pi * _SMOOTH**2) * sizes.sum() > _NOISY**2 * structure.sum()
         # a single band of rows may contain all the information
-        if too_noisy or np.linalg.matrix_rank(total - normal).min() < len(total):
+        if too_noisy or np.linalg.matrix_rank(total_normal - normal).min() < len(total_normal):
             continue
-        shares = np.linalg.solve(total, of_all)
-        unexplained = max(float(squares.sum() - shares @ of_all), 0.0) / sizes.sum()
-        without = np.linalg.solve(total - normal, (of_all - right)[..., None])[..., 0]
-        alone = np.sqrt(np.diag(np.linalg.inv(total)) * unexplained * _CORRELATED)
-        sigma, pixels = np.hypot(np.sqrt((len(sums) - 1) * without.var(axis=0)), alone), np.array([side, 1, 1, 1])
-        apart = float(np.mean([later - first for first, later in pairs])) / (len(data) - 1)
-        yield pairs[0], apart, shares[:4] * pixels, sigma[:4] * pixels
+        changes = np.linalg.solve(total_normal, total_right)
+        unexplained = max(float(squares.sum() - changes @ total_right), 0.0) / sizes.sum()
+        without = np.linalg.solve(total_normal - normal, (total_right - right_sides)[..., None])[..., 0]
+        sigma_of_residual = np.sqrt(np.diag(np.linalg.inv(total_normal)) * unexplained * _CORRELATED)
+        sigma, pixels = (
+            np.hypot(np.sqrt((len(sums) - 1) * without.var(axis=0)), sigma_of_residual),
+            np.array([side, 1, 1, 1]),
+        )
+        time_between = float(np.mean([later - first for first, later in pairs])) / (len(data) - 1)
+        yield pairs[0], time_between, changes[:4] * pixels, sigma[:4] * pixels
 
 
 def _pairs(geometry: Geometry, reach: float) -> Iterator[list[tuple[int, int]]]:
@@ -76,15 +79,18 @@ def _pairs(geometry: Geometry, reach: float) -> Iterator[list[tuple[int, int]]]:
     """
     angles, views, period = geometry.angles, np.arange(geometry.n_views), geometry.period
     firsts = spread(views, _FIRSTS)
-    later, off = views - firsts[:, None], np.abs((angles - angles[firsts, None] + period / 2) % period - period / 2)
-    for least in (_EXACT, _LINEAR):
-        row, second = np.nonzero((later >= views.size // _LATER) & (off <= least / reach))
+    later, angle_errors = (
+        views - firsts[:, None],
+        np.abs((angles - angles[firsts, None] + period / 2) % period - period / 2),
+    )
+    for limit in (_EXACT, _LINEAR):
+        row, second = np.nonzero((later >= views.size // _LATER) & (angle_errors <= limit / reach))
         if row.size:
-            first, apart, between = firsts[row], off[row, second], later[row, second]
-            longest = between >= _LONGEST * between.max()
-            some = np.flatnonzero(longest & (apart <= apart[longest].min() + 1e-4))
-            some = spread(some[np.argsort(second[some], kind="stable")], _PAIRS)
-            yield list(zip(first[some].tolist(), second[some].tolist(), strict=True))
+            first, angle_error, time_between = firsts[row], angle_errors[row, second], later[row, second]
+            longest = time_between >= _LONGEST * time_between.max()
+            chosen = np.flatnonzero(longest & (angle_error <= angle_error[longest].min() + 1e-4))
+            chosen = spread(chosen[np.argsort(second[chosen], kind="stable")], _PAIRS)
+            yield list(zip(first[chosen].tolist(), second[chosen].tolist(), strict=True))
 
 
 def _sums(
@@ -93,23 +99,23 @@ def _sums(
     """Sums for each band of rows: normal equations of the changes, squares of difference and structure, pixels."""
     (first, later), axis = pair, (geometry.axis_col + 0.5) / side - 0.5
     second = min(later, len(data) - 2)
-    beside = data[[first, later, second - 1, second, second + 1]]
-    view, seen, before, near, after = (
-        gaussian_filter(image.astype(np.float64), _SMOOTH, mode="nearest") for image in bin_views(beside, side)
+    images = data[[first, later, second - 1, second, second + 1]]
+    first_image, later_image, previous, middle, following = (
+        gaussian_filter(image.astype(np.float64), _SMOOTH, mode="nearest") for image in bin_views(images, side)
     )
-    cols = np.arange(view.shape[1], dtype=np.float64)
-    known = (cols >= _EDGE) & (cols < cols.size - _EDGE)
+    cols = np.arange(first_image.shape[1], dtype=np.float64)
+    seen_in_both = (cols >= _EDGE) & (cols < cols.size - _EDGE)
     if round(float(geometry.angles[later] - geometry.angles[first]) / np.pi) % 2:
-        across = 2 * axis - cols
-        view = np.stack([np.interp(across, cols, row) for row in view])
-        known &= (across >= 0) & (across <= cols.size - 1)
-    mean, heights = (view + seen) / 2, np.arange(len(view))[:, None] - (len(view) - 1) / 2
-    down, along = np.gradient(mean)
-    turned = along, after - before, after - 2 * near + before, np.ones_like(mean)
-    parts = [-down, mean, -(cols - axis) * along, -heights * down, *turned]
-    for rows in np.array_split(np.arange(len(view)), _BANDS):
-        shown, change = (
-            np.stack([part[rows][:, known].ravel() for part in parts]),
-            (seen - view)[rows][:, known].ravel(),
+        mirrored_cols = 2 * axis - cols
+        first_image = np.stack([np.interp(mirrored_cols, cols, row) for row in first_image])
+        seen_in_both &= (mirrored_cols >= 0) & (mirrored_cols <= cols.size - 1)
+    mean, heights = (first_image + later_image) / 2, np.arange(len(first_image))[:, None] - (len(first_image) - 1) / 2
+    row_gradient, col_gradient = np.gradient(mean)
+    other_effects = col_gradient, following - previous, following - 2 * middle + previous, np.ones_like(mean)
+    effect_images = [-row_gradient, mean, -(cols - axis) * col_gradient, -heights * row_gradient, *other_effects]
+    for rows in np.array_split(np.arange(len(first_image)), _BANDS):
+        effects, change = (
+            np.stack([part[rows][:, seen_in_both].ravel() for part in effect_images]),
+            (later_image - first_image)[rows][:, seen_in_both].ravel(),
         )
-        yield shown @ shown.T, shown @ change, change @ change, shown[1].var() * change.size, change.size
+        yield effects @ effects.T, effects @ change, change @ change, effects[1].var() * change.size, change.size

@@ -60,7 +60,7 @@ class Distortion:
         col, row, *factors = (float(line[1]) for line in lines)
         return cls(col, row, tuple(factors))
 
-    def seen_at(self, col: F64, row: F64) -> tuple[F64, F64]:
+    def on_detector(self, col: F64, row: F64) -> tuple[F64, F64]:
         """Position on the detector at which the lens shows (col, row)."""
         x, y = col - self.col, row - self.row
         r = np.hypot(x, y)
@@ -89,8 +89,8 @@ class Resampling:
     def reach(self) -> int:
         """Number of binned rows on each side from which a new row is interpolated, at most."""
         rows, cols = (np.linspace(0, n - 1, _LOOKED_AT) for n in self.shape)
-        seen = self._seen_at(*np.meshgrid(cols, rows))[1]
-        return math.ceil(float(np.abs(seen - rows[:, None]).max()) / self.binning) + _TAPS // 2
+        rows_on_detector = self._on_detector(*np.meshgrid(cols, rows))[1]
+        return math.ceil(float(np.abs(rows_on_detector - rows[:, None]).max()) / self.binning) + _TAPS // 2
 
     def apply(self, views: F32, first: int) -> None:
         """Resample projections [view, row, col] in place.
@@ -100,46 +100,47 @@ class Resampling:
         Args:
             first: detector row of the first row of the projections.
         """
-        rows, cols = self._places(views.shape[1:], first)
+        rows, cols = self._positions_in_given(views.shape[1:], first)
         table = _weights()
         for view in views:
-            _resample(view.copy(), *_split(rows), *_split(cols), table, view)
+            _resample(view.copy(), *_whole_and_phase(rows), *_whole_and_phase(cols), table, view)
 
     def nearest(self, image: NDArray[Any], first: int) -> NDArray[Any]:
         """An image [row, col] resampled without interpolation. It is meant for masks."""
-        rows, cols = self._places(image.shape, first)
+        rows, cols = self._positions_in_given(image.shape, first)
         row, col = (
-            np.clip(np.rint(at), 0, n - 1).astype(np.int64) for at, n in zip((rows, cols), image.shape, strict=True)
+            np.clip(np.rint(positions), 0, n - 1).astype(np.int64)
+            for positions, n in zip((rows, cols), image.shape, strict=True)
         )
         return np.asarray(image[row, col])
 
-    def unseen(self, shape: tuple[int, int], first: int) -> NDArray[np.bool_]:
+    def outside_detector(self, shape: tuple[int, int], first: int) -> NDArray[np.bool_]:
         """Mask [row, col] of the new pixels outside the detector, for projections that begin at row `first`."""
-        rows, cols = self.places(shape, first)
-        high, wide = self.shape
-        return (rows < -0.5) | (rows > high - 0.5) | (cols < -0.5) | (cols > wide - 0.5)
+        rows, cols = self.positions(shape, first)
+        n_rows, n_cols = self.shape
+        return (rows < -0.5) | (rows > n_rows - 0.5) | (cols < -0.5) | (cols > n_cols - 0.5)
 
-    def places(self, shape: tuple[int, ...], first: int) -> tuple[F64, F64]:
+    def positions(self, shape: tuple[int, ...], first: int) -> tuple[F64, F64]:
         """Positions (row, col) of the new pixels on the detector, each [row, col]; projections begin at row `first`."""
         rows, cols = (np.arange(length) * self.binning + (self.binning - 1) / 2 for length in shape[-2:])
-        col, row = self._seen_at(*np.meshgrid(cols, rows + first))
+        col, row = self._on_detector(*np.meshgrid(cols, rows + first))
         return row, col
 
-    def _places(self, shape: tuple[int, ...], first: int) -> tuple[F64, F64]:
+    def _positions_in_given(self, shape: tuple[int, ...], first: int) -> tuple[F64, F64]:
         """Positions (row, col) of the new pixels in the given projections."""
-        row, col = self.places(shape, first)
+        row, col = self.positions(shape, first)
         middle = (self.binning - 1) / 2
         return (row - middle) / self.binning - first / self.binning, (col - middle) / self.binning
 
-    def _seen_at(self, col: F64, row: F64) -> tuple[F64, F64]:
+    def _on_detector(self, col: F64, row: F64) -> tuple[F64, F64]:
         middle_row, middle_col = ((n - 1) / 2 for n in self.shape)
         c, s = math.cos(self.tilt), math.sin(self.tilt)
         x, y = col - middle_col, row - middle_row
         col, row = middle_col + c * x + s * y, middle_row + c * y - s * x
-        return (col, row) if self.distortion is None else self.distortion.seen_at(col, row)
+        return (col, row) if self.distortion is None else self.distortion.on_detector(col, row)
 
 
-def _split(positions: F64) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
+def _whole_and_phase(positions: F64) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
     """The integer part of a position, and its fraction in units of 1 / number of phases."""
     steps = np.rint(positions * _PHASES)
     whole = np.floor(steps / _PHASES)
@@ -168,12 +169,12 @@ def _resample(view, row, row_phase, col, col_phase, table, out):
     for i in prange(rows):
         for j in range(cols):
             r0, c0 = row[i, j] - _BEFORE, col[i, j] - _BEFORE
-            down, along = table[row_phase[i, j]], table[col_phase[i, j]]
+            row_weights, col_weights = table[row_phase[i, j]], table[col_phase[i, j]]
             total = np.float32(0)
             for k in range(_TAPS):
                 line = view[min(max(r0 + k, 0), rows - 1)]
-                part = np.float32(0)
+                row_sum = np.float32(0)
                 for m in range(_TAPS):
-                    part += along[m] * line[min(max(c0 + m, 0), cols - 1)]
-                total += down[k] * part
+                    row_sum += col_weights[m] * line[min(max(c0 + m, 0), cols - 1)]
+                total += row_weights[k] * row_sum
             out[i, j] = total

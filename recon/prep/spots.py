@@ -76,14 +76,14 @@ class SpotFilter:
         root: function that returns the √transmission of a projection, in which photon noise is the same everywhere.
         before: the last projection whose spots were filled, as √transmission; None: there is none.
         waiting: the newest projection, which waits for the next one; None: no projection waits.
-        left: number of pixels of spots that were too large to be filled, in all projections so far.
+        n_unfilled: number of pixels of spots that were too large to be filled, in all projections so far.
     """
 
     threshold: float
     root: Callable[[F32], F32]
     before: Image | None = None
     waiting: Transmission | None = None
-    left: int = 0
+    n_unfilled: int = 0
 
     def feed(
         self,
@@ -105,22 +105,22 @@ class SpotFilter:
         if self.waiting is not None:
             views = self.waiting[[0]] if views is None else self.waiting.and_then(views)
         assert views is not None
-        total, before, left = len(views.data), self.before, self.left
+        total, before, n_unfilled = len(views.data), self.before, self.n_unfilled
         n, order = total if last else max(total - 1, 0), np.arange(total) if order is None else order
-        here = self.root(views.data[order[0]]) if n else None
+        current = self.root(views.data[order[0]]) if n else None
         for done, view in enumerate(order[:n], 1):
             after = self.root(views.data[order[done]]) if done < total else None
-            if here is not None and np.isfinite(self.threshold):
-                found, large = spots(here, before, after, self.threshold)
-                left += large
-                if found.any():
-                    views.repaired[view] += found.sum()
-                    fill(views.data[view], plan_fill(found))
-                    here = self.root(views.data[view])
-            before, here = here, after
+            if current is not None and np.isfinite(self.threshold):
+                mask, n_large = spots(current, before, after, self.threshold)
+                n_unfilled += n_large
+                if mask.any():
+                    views.repaired[view] += mask.sum()
+                    fill(views.data[view], plan_fill(mask))
+                    current = self.root(views.data[view])
+            before, current = current, after
             progress(done)
         waiting = views[np.arange(n, total)] if n < total else None
-        return views[:n], replace(self, before=before, waiting=waiting, left=left)
+        return views[:n], replace(self, before=before, waiting=waiting, n_unfilled=n_unfilled)
 
 
 def without_spots(frames: Iterable[NDArray[Any]], intensity: float) -> Iterator[tuple[NDArray[Any], int]]:
@@ -132,21 +132,21 @@ def without_spots(frames: Iterable[NDArray[Any]], intensity: float) -> Iterator[
         intensity: counts in the open beam.
     """
     before: NDArray[Any] | None = None
-    left = iter(frames)
-    here = next(left, None)
-    while here is not None:
-        after = next(left, None)
-        n, beside = 0, [each for each in (before, after) if each is not None]
-        if beside:
-            first, second = (None if each is None else _root_of(each, intensity) for each in (before, after))
-            found, _ = spots(_root_of(here, intensity), first, second, SPOT_ERRORS, still=True)
-            if n := int(np.count_nonzero(found)):
-                here = np.where(found, np.mean(beside, axis=0), here)
-        yield here, n
-        before, here = here, after
+    remaining = iter(frames)
+    current = next(remaining, None)
+    while current is not None:
+        after = next(remaining, None)
+        n, neighbours = 0, [each for each in (before, after) if each is not None]
+        if neighbours:
+            first, second = (None if each is None else _root_intensity(each, intensity) for each in (before, after))
+            mask, _ = spots(_root_intensity(current, intensity), first, second, SPOT_ERRORS, still=True)
+            if n := int(np.count_nonzero(mask)):
+                current = np.where(mask, np.mean(neighbours, axis=0), current)
+        yield current, n
+        before, current = current, after
 
 
-def _root_of(counts: NDArray[Any], intensity: float) -> Image:
+def _root_intensity(counts: NDArray[Any], intensity: float) -> Image:
     return np.sqrt(np.maximum(counts, 0) / max(intensity, 1e-30), dtype=np.float32)
 
 
@@ -173,16 +173,16 @@ def spots(
             deviations once in 10¹⁵ pixels.
         still: True if there is no moving sample, as in darks and flats.
     """
-    found, beside = np.zeros(view.shape, np.bool_), [image for image in (before, after) if image is not None]
-    first, *others = beside or [np.zeros_like(view)] * 2
+    mask, neighbours = np.zeros(view.shape, np.bool_), [image for image in (before, after) if image is not None]
+    first, *others = neighbours or [np.zeros_like(view)] * 2
     second, against = others[0] if others else first, others[0] if others else view
     noise, change = _noise_and_change(view, first, second)
     limit = threshold * max(noise / _MEDIAN, _LEAST)
     if change > 1 + _LEAST:
         first, second = first * np.float32(change), second * np.float32(change)
         against = second if others else view
-    beam = 1.0 if beside and not still else np.inf
-    return found, _mark(view, first, second, against, limit, beam, threshold / _MEDIAN, found)
+    beam = 1.0 if neighbours and not still else np.inf
+    return mask, _mark(view, first, second, against, limit, beam, threshold / _MEDIAN, mask)
 
 
 @njit(nogil=True, cache=True)
@@ -195,25 +195,25 @@ def _noise_and_change(view, before, after):  # type: ignore[no-untyped-def]
     rows, cols = view.shape
     step = max(1, rows * cols // _SAMPLE)
     differences, ratios = np.empty((2, rows * cols // step + 1), np.float32)
-    n = lit = 0
-    more = 0.0
-    for at in range(0, rows * cols, step):
-        r, c = at // cols, at % cols
+    n = n_exposed = 0
+    excess = 0.0
+    for pixel in range(0, rows * cols, step):
+        r, c = pixel // cols, pixel % cols
         if c + 1 < cols and view[r, c] > _OPAQUE:
             differences[n] = abs(view[r, c + 1] - view[r, c])
             n += 1
-        usual = max(before[r, c], after[r, c])
-        if usual > _OPAQUE:
-            ratios[lit] = view[r, c] / usual
-            more += view[r, c] - usual
-            lit += 1
+        brighter_neighbour = max(before[r, c], after[r, c])
+        if brighter_neighbour > _OPAQUE:
+            ratios[n_exposed] = view[r, c] / brighter_neighbour
+            excess += view[r, c] - brighter_neighbour
+            n_exposed += 1
     noise = np.median(differences[:n]) if n > _FEWEST else 0.0
-    return noise, np.median(ratios[:lit]) if more > 0 else 0.0
+    return noise, np.median(ratios[:n_exposed]) if excess > 0 else 0.0
 
 
 @njit(nogil=True, cache=True)
 def _mark(  # type: ignore[no-untyped-def]
-    view, before, after, against, limit, beam, errors, found
+    view, before, after, against, limit, beam, errors, mask
 ):
     """Mark the spots for `spots`, and count the pixels of spots that are too large.
 
@@ -222,7 +222,7 @@ def _mark(  # type: ignore[no-untyped-def]
     """
     rows, cols = view.shape
     differences = np.empty((2 * _AROUND + 1) ** 2, np.float32)
-    left, brightest = 0, beam
+    n_unfilled, brightest = 0, beam
     for r in range(rows):
         for c in range(cols):
             brightest = max(brightest, min(before[r, c], after[r, c]))
@@ -251,6 +251,6 @@ def _mark(  # type: ignore[no-untyped-def]
                     for j in range(max(0, c - _AROUND), min(cols, c + _AROUND + 1)):
                         differences[n] = abs(before[i, j] - against[i, j])
                         n += 1
-                found[r, c] = height > errors * np.median(differences[:n])
-            left += stray and height <= limit
-    return left
+                mask[r, c] = height > errors * np.median(differences[:n])
+            n_unfilled += stray and height <= limit
+    return n_unfilled

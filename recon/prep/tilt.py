@@ -86,35 +86,37 @@ def line_through(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
     Raises:
         ValueError: there is no clear optimum.
     """
-    step, far = float(candidates[1] - candidates[0]), float(np.abs(heights).max())
-    most = math.ceil(math.tan(STEEPEST) * far / step)
+    step, farthest = float(candidates[1] - candidates[0]), float(np.abs(heights).max())
+    most_steps = math.ceil(math.tan(STEEPEST) * farthest / step)
     curves = np.maximum(curves, _FLOOR)
-    padded = np.pad(np.log(curves), ((0, 0), (most, most)), mode="edge")
+    padded = np.pad(np.log(curves), ((0, 0), (most_steps, most_steps)), mode="edge")
     n, best, lowest = candidates.size, (0, 0), math.inf
-    for slope in range(-most, most + 1):
-        shifts = np.rint(slope * heights / far).astype(int) + most
+    for slope in range(-most_steps, most_steps + 1):
+        shifts = np.rint(slope * heights / farthest).astype(int) + most_steps
         total = sum(curve[shift : shift + n] for curve, shift in zip(padded, shifts, strict=True))
         index = int(np.argmin(total))
         if total[index] < lowest:
             best, lowest = (slope, index), float(total[index])
     slope, index = best
     typical = float(np.median(np.log(curves).sum(axis=0)))
-    if abs(slope) == most or not 0 < index < n - 1 or typical - lowest < _DEEP * heights.size:
+    if abs(slope) == most_steps or not 0 < index < n - 1 or typical - lowest < _DEEP * heights.size:
         raise ValueError("no clear optimum")
     from scipy.interpolate import CubicSpline  # loading takes half a second
 
     splines = [CubicSpline(candidates, np.log(curve)) for curve in curves]
-    every, start = np.arange(heights.size), np.array([candidates[index], slope * step / far])
-    line = _best_line(splines, heights, every, start)
+    all_bands, start = np.arange(heights.size), np.array([candidates[index], slope * step / farthest])
+    line = _best_line(splines, heights, all_bands, start)
     variances = []
     for count in (heights.size, max(FEWEST_BANDS, heights.size // 3)):
-        parts = np.array_split(every, count)
-        slopes = [_best_line(splines, heights, np.setdiff1d(every, part), line)[1] for part in parts]
+        parts = np.array_split(all_bands, count)
+        slopes = [_best_line(splines, heights, np.setdiff1d(all_bands, part), line)[1] for part in parts]
         variances.append((count - 1) * np.var(slopes))
     index = line[0] + line[1] * heights
-    near = np.clip(index[:, None] + np.linspace(-_OWN, _OWN, 20 * _OWN + 1), candidates[0], candidates[-1])
-    own = np.array([x[np.argmin(spline(x))] for spline, x in zip(splines, near, strict=True)]) - index
-    scatter = float(np.median(np.abs(own))) * _SIGMAS / math.sqrt(float(((heights - heights.mean()) ** 2).sum()))
+    search_cols = np.clip(index[:, None] + np.linspace(-_OWN, _OWN, 20 * _OWN + 1), candidates[0], candidates[-1])
+    own_deviations = np.array([x[np.argmin(spline(x))] for spline, x in zip(splines, search_cols, strict=True)]) - index
+    scatter = (
+        float(np.median(np.abs(own_deviations))) * _SIGMAS / math.sqrt(float(((heights - heights.mean()) ** 2).sum()))
+    )
     uncertainty = math.hypot(math.sqrt(max(variances)), scatter)
     return TiltEstimate(math.atan(line[1]), uncertainty / (1 + line[1] ** 2), float(line[0]))
 
@@ -126,8 +128,8 @@ def _best_line(splines: list[CubicSpline], heights: F64, bands: NDArray[np.int64
     def total(line: F64) -> float:
         return sum(float(splines[band](line[0] + line[1] * heights[band])) for band in bands)
 
-    far = float(np.abs(heights).max())
-    corners = start + np.array([[0, 0], [0.5, 0], [0, 0.5 / far]])
+    farthest = float(np.abs(heights).max())
+    corners = start + np.array([[0, 0], [0.5, 0], [0, 0.5 / farthest]])
     return np.asarray(
         minimize(total, start, method="Nelder-Mead", options={"initial_simplex": corners, "xatol": 1e-5}).x
     )
@@ -154,14 +156,22 @@ def roll_of_mean_view(mean: F64, axis_col: float) -> tuple[float, float]:
     if reach < FEWEST_COLS // 2 or rows < 2 * FEWEST_BANDS:
         return math.nan, math.nan
     across, heights = np.arange(-reach, reach + 1.0), np.arange(rows)[:, None] - (rows - 1) / 2
-    seen = np.stack([np.interp(axis_col + across, np.arange(cols), row) for row in mean])
-    even, odd = (seen + seen[:, ::-1]) / 2, (seen - seen[:, ::-1]) / 2
-    down, along = np.gradient(even)
-    askew = across**2 * along + heights * across * down
-    parts = np.stack([across * down - heights * along, -along, askew, across * even, across + 0 * heights])
+    centred = np.stack([np.interp(axis_col + across, np.arange(cols), row) for row in mean])
+    even, odd = (centred + centred[:, ::-1]) / 2, (centred - centred[:, ::-1]) / 2
+    row_gradient, col_gradient = np.gradient(even)
+    skew_effect = across**2 * col_gradient + heights * across * row_gradient
+    effects = np.stack(
+        [
+            across * row_gradient - heights * col_gradient,
+            -col_gradient,
+            skew_effect,
+            across * even,
+            across + 0 * heights,
+        ]
+    )
     bands = [np.s_[:, part] for part in np.array_split(np.arange(rows), 2 * FEWEST_BANDS)]
-    flat = [(parts[band].reshape(len(parts), -1), odd[band[1]].ravel()) for band in bands]
-    normal, right = np.stack([p @ p.T for p, _ in flat]), np.stack([p @ o for p, o in flat])
-    without = np.linalg.pinv(normal.sum(axis=0) - normal) @ (right.sum(axis=0) - right)[..., None]
+    sums_of_bands = [(effects[band].reshape(len(effects), -1), odd[band[1]].ravel()) for band in bands]
+    normal, right = np.stack([p @ p.T for p, _ in sums_of_bands]), np.stack([p @ o for p, o in sums_of_bands])
+    without_band = np.linalg.pinv(normal.sum(axis=0) - normal) @ (right.sum(axis=0) - right)[..., None]
     roll = float((np.linalg.pinv(normal.sum(axis=0)) @ right.sum(axis=0))[0])
-    return roll, float(np.sqrt((len(bands) - 1) * without[:, 0, 0].var()))
+    return roll, float(np.sqrt((len(bands) - 1) * without_band[:, 0, 0].var()))

@@ -50,22 +50,25 @@ def unmeasured(values: NDArray[np.generic], intensity: F32, hidden: Mask, foreig
     unknown = low & ~np.isfinite(intensity) & ~hidden
     if not (_corners(low).any() or (foreign is not None and foreign.any()) or unknown.any()):
         return None
-    labels, nothing_seen = _at_borders(low, hidden), np.zeros_like(low)
+    labels, without_data = _dark_areas_at_borders(low, hidden), np.zeros_like(low)
     for label in {*_corners(labels).flat} - {0}:
         part = (labels == label) & low & ~hidden & ~unknown
         solid = np.mean((low | hidden)[labels == label]) > _ONE_VALUE
-        stored, seen = values[part], intensity[part].astype(np.float64)
+        stored_values, transmissions = values[part], intensity[part].astype(np.float64)
         if (
             part.any()
             and solid
-            and (np.mean(stored == np.median(stored)) > _ONE_VALUE or seen.mean() < -_BELOW * seen.std())
+            and (
+                np.mean(stored_values == np.median(stored_values)) > _ONE_VALUE
+                or transmissions.mean() < -_BELOW * transmissions.std()
+            )
         ):
-            nothing_seen |= labels == label
+            without_data |= labels == label
     if foreign is not None:
-        nothing_seen |= (labels > 0) & foreign[:, None]
-    nothing_seen = with_rim(nothing_seen & ~hidden, np.where(hidden, np.float32(np.nan), intensity)) | areas(unknown)
-    nothing_seen &= ~hidden
-    return nothing_seen if nothing_seen.any() and not (nothing_seen | hidden).all() else None
+        without_data |= (labels > 0) & foreign[:, None]
+    without_data = with_rim(without_data & ~hidden, np.where(hidden, np.float32(np.nan), intensity)) | areas(unknown)
+    without_data &= ~hidden
+    return without_data if without_data.any() and not (without_data | hidden).all() else None
 
 
 def with_rim(dark: Mask, intensity: F32) -> Mask:
@@ -78,16 +81,16 @@ def with_rim(dark: Mask, intensity: F32) -> Mask:
     Args:
         intensity: transmission [row, col]; NaN: unknown.
     """
-    found, at = dark.copy(), np.arange(1, _RIM + _BEYOND + 1)
-    lines = np.pad(np.where(dark, np.nan, np.log(np.maximum(intensity, DARK))), at[-1], mode="edge")
-    for turn in range(4):
-        area, known = np.rot90(found, turn), np.rot90(lines, turn)
+    extended, distances = dark.copy(), np.arange(1, _RIM + _BEYOND + 1)
+    lines = np.pad(np.where(dark, np.nan, np.log(np.maximum(intensity, DARK))), distances[-1], mode="edge")
+    for quarter_turns in range(4):
+        area, known = np.rot90(extended, quarter_turns), np.rot90(lines, quarter_turns)
         row, col = np.nonzero(area[:, :-1] & ~area[:, 1:])
-        beside, reach = known[at[-1] + row[:, None], at[-1] + col[:, None] + at], 0
+        beside, reach = known[distances[-1] + row[:, None], distances[-1] + col[:, None] + distances], 0
         while row.size and reach < _RIM and _mixed(beside[:, reach : reach + 1 + _BEYOND]):
             reach += 1
             area[row, np.minimum(col + reach, area.shape[1] - 1)] = True
-    return found
+    return extended
 
 
 def _mixed(lines: F64) -> bool:
@@ -96,11 +99,11 @@ def _mixed(lines: F64) -> bool:
     lines = lines[np.isfinite(lines).all(axis=1)]
     if not len(lines):
         return True
-    others = lines[:, 1:]
-    steps = (others[:, -1] - others[:, 0]) / (_BEYOND - 1)
-    away = lines[:, 0] - others.mean(axis=1) + steps * (_BEYOND + 1) / 2
-    middle = np.median(away)
-    return bool(abs(middle) > max(_ALTERED, _SURE * median_deviation(away - middle) / np.sqrt(len(away))))
+    farther = lines[:, 1:]
+    steps = (farther[:, -1] - farther[:, 0]) / (_BEYOND - 1)
+    deviations = lines[:, 0] - farther.mean(axis=1) + steps * (_BEYOND + 1) / 2
+    middle = np.median(deviations)
+    return bool(abs(middle) > max(_ALTERED, _SURE * median_deviation(deviations - middle) / np.sqrt(len(deviations))))
 
 
 def foreign_rows(intensity: F32, angles: F64) -> Mask:
@@ -110,11 +113,13 @@ def foreign_rows(intensity: F32, angles: F64) -> Mask:
         intensity: transmission [view, row, col], finite, of projections from all directions.
         angles: their angles in radians.
     """
-    lit = (intensity > DARK).any(axis=(1, 2))
-    intensity, angles = intensity[lit], angles[lit]
-    if not lit.any():
+    exposed = (intensity > DARK).any(axis=(1, 2))
+    intensity, angles = intensity[exposed], angles[exposed]
+    if not exposed.any():
         return np.zeros(intensity.shape[1], np.bool_)
-    dark: Mask = np.stack([_at_borders(view <= DARK, np.zeros(view.shape, np.bool_)) > 0 for view in intensity])
+    dark: Mask = np.stack(
+        [_dark_areas_at_borders(view <= DARK, np.zeros(view.shape, np.bool_)) > 0 for view in intensity]
+    )
     has_dark: Mask = np.any(dark, axis=2)
     rows = has_dark.any(axis=0) & ~has_dark.all(axis=0)
     with_dark = has_dark[:, rows].any(axis=1)
@@ -128,17 +133,20 @@ def foreign_rows(intensity: F32, angles: F64) -> Mask:
             lines[view] = 0
         else:
             fill(lines[view], plan_fill(hidden))
-    free = np.flatnonzero(~with_dark)[np.argsort(angles[~with_dark])]
-    usual = np.interp(angles[with_dark], angles[free], mass[free])
-    brought, remaining = mass[with_dark] - usual, lines[with_dark].sum(axis=(1, 2), dtype=np.float64) - usual
-    return rows & (brought.sum() > 0 and np.abs(remaining).sum() < _CLEARLY * np.abs(brought).sum())
+    without_dark = np.flatnonzero(~with_dark)[np.argsort(angles[~with_dark])]
+    expected_mass = np.interp(angles[with_dark], angles[without_dark], mass[without_dark])
+    added_mass, remaining_mass = (
+        mass[with_dark] - expected_mass,
+        lines[with_dark].sum(axis=(1, 2), dtype=np.float64) - expected_mass,
+    )
+    return rows & (added_mass.sum() > 0 and np.abs(remaining_mass).sum() < _CLEARLY * np.abs(added_mass).sum())
 
 
 def with_borders_filled(image: NDArray[Any]) -> NDArray[Any]:
     """An image of counts in which areas of exact zeros at the corners get the value of the nearest other pixel."""
     if (_corners(image) != 0).all():
         return image
-    labels = _at_borders(image == 0, np.zeros(image.shape, np.bool_))
+    labels = _dark_areas_at_borders(image == 0, np.zeros(image.shape, np.bool_))
     blank = ndimage.binary_dilation(np.isin(labels, _corners(labels)) & (labels > 0), _BLOCK, 2)
     nearest = ndimage.distance_transform_edt(blank, return_distances=False, return_indices=True)
     return image if blank.all() else image[tuple(nearest)]
@@ -152,7 +160,7 @@ def runs_of(mask: Mask, view: int) -> I64:
     return np.stack([np.full(row.size, view), row, first, end], axis=1).astype(np.int64)
 
 
-def _at_borders(low: Mask, hidden: Mask) -> NDArray[np.int32]:
+def _dark_areas_at_borders(low: Mask, hidden: Mask) -> NDArray[np.int32]:
     """Numbered areas [row, col] of dark pixels that reach a border of the frame or a hidden area there; 0: no area."""
     if sum(np.count_nonzero(side) for side in (low[0], low[-1], low[:, 0], low[:, -1])) < _FEWEST:
         return np.zeros(low.shape, np.int32)

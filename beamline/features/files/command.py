@@ -18,7 +18,7 @@ from beamline.core.files import refuse_existing, write_whole
 from beamline.core.text import SENTENCE, aligned, count, one_line, printable
 
 if TYPE_CHECKING:
-    from beamline.projections.scan_statistics import LightAsked
+    from beamline.projections.scan_statistics import DoseRequest
     from beamline.storage.readers.open import SourceOptions
 
 _PATH = click.Path(path_type=Path)
@@ -113,10 +113,10 @@ def _described(facts: Mapping[str, Any]) -> list[str]:
 
 
 def _print_statistics(
-    scan: SourceOptions, output: Path | None, light_request: LightAsked | None, as_json: bool
+    scan: SourceOptions, output: Path | None, light_request: DoseRequest | None, as_json: bool
 ) -> None:
     from beamline.monitor.digest import LARGEST
-    from beamline.projections.scan_statistics import histograms, light_of, statistics_of, table
+    from beamline.projections.scan_statistics import histograms, photon_dose_of, statistics_of, table
     from beamline.storage.readers.open import open_scan
 
     with answering(as_json) as answer:
@@ -126,7 +126,7 @@ def _print_statistics(
             if light_request is not None:
                 light_request.refuse_impossible(source)
             statistics = statistics_of(source, answer.counting("statistics"))
-            dose = [] if light_request is None else light_of(source, statistics, light_request).in_words()
+            dose = [] if light_request is None else photon_dose_of(source, statistics, light_request).in_words()
         rows = table(statistics)
         if output is not None:
             write_whole(output, histograms(statistics))

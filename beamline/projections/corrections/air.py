@@ -48,7 +48,7 @@ _MODELS: dict[str, tuple[Columns, Surface]] = {
 }  # fmt: skip
 
 
-def _parts(text: str) -> tuple[Columns, Surface]:
+def _columns_and_surface(text: str) -> tuple[Columns, Surface]:
     """Which columns at the detector's edges show air, and the background surface that is subtracted."""
     if match := re.fullmatch(r"(\d+),(\d+)", text):
         return (int(match[1]), int(match[2])), "none"
@@ -63,7 +63,7 @@ def _parts(text: str) -> tuple[Columns, Surface]:
 
 
 def _model(text: str) -> str:
-    _parts(text)
+    _columns_and_surface(text)
     return text
 
 
@@ -95,12 +95,14 @@ class Air:
         """
         from recon.base.reach import LEAST
 
-        return replace(before, air=_parts(self.model)[0], sample_from=LEAST if self.model == "auto" else math.inf)
+        return replace(
+            before, air=_columns_and_surface(self.model)[0], sample_from=LEAST if self.model == "auto" else math.inf
+        )
 
     @property
     def surface(self) -> Surface:
         """The background surface that is subtracted, see `without_background`."""
-        return _parts(self.model)[1]
+        return _columns_and_surface(self.model)[1]
 
     def memory(self, part: ScanPart) -> StepMemory:
         return StepMemory(alone=0 if self.surface == "none" else background_memory(part.geometry))
@@ -115,10 +117,10 @@ class Air:
         sentence, terms = without_background(
             views.seen, self.surface, views.lines.unseen, areas(views.corrected.masked), levelled
         )  # fmt: skip
-        line = any(views.corrected.air_columns)
+        has_line = any(views.corrected.air_columns)
         nothing = (
             "no polynomial subtracted, only a straight line through the air at the edges"
-            if line
+            if has_line
             else "nothing subtracted"
         )
         parameters: dict[str, Any] = {"surface": self.surface, "background": sentence or nothing}
@@ -129,17 +131,15 @@ def background_memory(geometry: Geometry) -> int:
     """Approximate peak memory of `without_background` in bytes, without the projections themselves."""
     from recon.voxels.fbp import fbp_memory
 
-    small = geometry.binned(factor_within(geometry.detector_shape, _VOXELS))
-    n, pixels, grid = geometry.n_views, math.prod(small.detector_shape), Grid.matching(small)
-    n_looked_at = min(n, _VIEWS)
+    binned = geometry.binned(factor_within(geometry.detector_shape, _VOXELS))
+    n, pixels, grid = geometry.n_views, math.prod(binned.detector_shape), Grid.matching(binned)
+    n_sampled = min(n, _VIEWS)
     fit = 8 * (_TERMS * pixels + _SUMS * n)
-    volume = 4 * _COPIES * math.prod(grid.shape) + fbp_memory(n_looked_at, grid.shape[2])
-    return (
-        fit + volume + 4 * (4 * n_looked_at + 3 * min(n, _AT_ONCE)) * pixels + 16 * math.prod(geometry.detector_shape)
-    )
+    volume = 4 * _COPIES * math.prod(grid.shape) + fbp_memory(n_sampled, grid.shape[2])
+    return fit + volume + 4 * (4 * n_sampled + 3 * min(n, _AT_ONCE)) * pixels + 16 * math.prod(geometry.detector_shape)
 
 
-class _Views:
+class _BinnedViews:
     """Yields line integrals [view, row, col], binned and finite, with their geometry; N projections at a time."""
 
     def __init__(self, data: F32, geometry: Geometry, unknown: Mask | None) -> None:
@@ -152,7 +152,7 @@ class _Views:
     def binned(self, numbers: NDArray[np.int64]) -> F32:
         from recon.base.masks import masked
 
-        return np.concatenate([bin_views(masked(self.data[k : k + 1])[0], self.factor) for k in numbers])
+        return np.concatenate([bin_views(masked(self.data[view : view + 1])[0], self.factor) for view in numbers])
 
     def sums(self, sample: Mask, grid: Grid, numbers: NDArray[np.int64]) -> AirSums:
         """Sums over the rays of some projections that miss the sample; the sample is a mask on a grid."""
@@ -170,7 +170,7 @@ class _Views:
 def without_background(
     of_scan: Views,
     surface: Surface,
-    others: Views | None = None,
+    held_out: Views | None = None,
     unknown: Mask | None = None,
     levelled: float = 0.0,
 ) -> tuple[str, F64 | None]:
@@ -180,7 +180,7 @@ def without_background(
 
     Args:
         surface: "auto": subtract it if the projections confirm it; a number: polynomials of this order.
-        others: further projections, from which the same background is subtracted.
+        held_out: further projections, from which the same background is subtracted.
         unknown: bool [row, col], pixels that were not measured.
         levelled: line integral of the air at the edges that was already subtracted, mean over the projections.
 
@@ -194,11 +194,11 @@ def without_background(
         return "", None
     order = None if surface == "auto" else surface
     data = of_scan.data
-    views = _Views(data, of_scan.geometry, unknown)
+    views = _BinnedViews(data, of_scan.geometry, unknown)
     fills_field = reach_of(of_scan).beyond  # such a sample would look like air
     shows_air = _see_all_sides(of_scan.geometry) and not fills_field
-    fitted, where = _fitted(views, order) if shows_air else (None, None)
-    if fitted is None or where is None:
+    fitted, sample_on_grid = _fitted(views, order) if shows_air else (None, None)
+    if fitted is None or sample_on_grid is None:
         if order is None:
             return "", None
         raise DataError(
@@ -216,11 +216,11 @@ def without_background(
             f"material all around the sample: {description}. If the sample is surrounded by air, give --air "
             f"surface:{fitted.order}."
         ), None
-    if others is not None:
-        more = _Views(others.data, others.geometry, unknown)
-        unseen = more.sums(*where, np.arange(len(more.data))).fit(fitted.order)
-        if unseen is not None:
-            unseen.remove(more.data)
+    if held_out is not None:
+        binned_others = _BinnedViews(held_out.data, held_out.geometry, unknown)
+        background_of_others = binned_others.sums(*sample_on_grid, np.arange(len(binned_others.data))).fit(fitted.order)
+        if background_of_others is not None:
+            background_of_others.remove(binned_others.data)
     fitted.remove(data)
     sentence = (
         f"Background of the beam subtracted: {description}. The line integral of air was up to "
@@ -251,27 +251,27 @@ def _see_all_sides(geometry: Geometry) -> bool:
     return geometry.n_views >= _LEAST_VIEWS and bool(gaps.max() < _WIDEST_GAP)
 
 
-def _fitted(views: _Views, order: int | None) -> tuple[Background | None, tuple[Mask, Grid]]:
+def _fitted(views: _BinnedViews, order: int | None) -> tuple[Background | None, tuple[Mask, Grid]]:
     """The background of all projections, and a first volume from some projections, which shows where the sample is."""
-    from recon.prep.background import matter
+    from recon.prep.background import near_material
     from recon.splatting.initialise import first_volume
 
     n, geometry = len(views.data), views.geometry
     numbers = spread(np.arange(n), _VIEWS)
     subset, grid = geometry.select(numbers), Grid.matching(geometry)
     _, y, x = grid.coordinates()
-    away = np.hypot(y[:, None], x)
+    radius = np.hypot(y[:, None], x)
     measured = views.binned(numbers)
     fitted = None
-    for last, rim in enumerate(_RIMS):
-        levelled = measured.copy()
+    for round_number, rim in enumerate(_RIMS):
+        flattened = measured.copy()
         if fitted is not None:
-            fitted.remove(levelled, factor=views.factor)
-        inside = away <= geometry.reach - rim * grid.voxel_size
+            fitted.remove(flattened, factor=views.factor)
+        inside = radius <= geometry.reach - rim * grid.voxel_size
         if not inside.any():  # a detector with a few columns has no voxel inside the sample
             return None, (np.zeros(grid.shape, np.bool_), grid)
-        sample = matter(first_volume(levelled, subset, grid).data, inside)
-        fitted = views.sums(sample, grid, np.arange(n) if last else numbers).fit(order)
+        sample = near_material(first_volume(flattened, subset, grid).data, inside)
+        fitted = views.sums(sample, grid, np.arange(n) if round_number else numbers).fit(order)
         if fitted is None:
             break
     return fitted, (sample, grid)

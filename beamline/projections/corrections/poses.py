@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from recon.base.geometry import Geometry
 
 _SAME_SIZE = 0.01  # share of a pixel
-_OFF = 0.25  # share of the step between two projections: an angle that differs by more belongs to another projection
+# share of the step between two projections: an angle that differs by more belongs to another projection
+_ANGLE_TOLERANCE = 0.25
 
 
 def _table(text: str) -> PoseTable:
@@ -168,17 +169,17 @@ def poses_of(scan: SelectedScan, frames: I64) -> ScanPoses | None:
             "--tilt and --poses both set the roll of the projections. Omit --tilt, and add the tilt to the column "
             f"roll_deg of {table.path}."
         )
-    for learns in (step.asked_by for step in geometry_steps(selection) if step.geometry):
+    for learns in (step.requested_by for step in geometry_steps(selection) if step.geometry):
         raise ConfigError(
             f"{learns} determines from the projections what {table.path} already states. Give either {learns} or "
             "--poses. To omit the shifts that the scan states, add --poses ignore."
         )
-    shifts = table.shifts * _pixels(table, scan)
-    rows = _rows(table, source, frames)
+    shifts = table.shifts * _pixels_per_unit(table, scan)
+    rows = _rows_of_frames(table, source, frames)
     height, width = source.shape
     # the displacement of offset projections is at most a few fields of view
-    if (far := (np.abs(shifts) >= (8 * width, height)).any(axis=1)).any():
-        row = int(np.flatnonzero(far)[0])
+    if (too_far := (np.abs(shifts) >= (8 * width, height)).any(axis=1)).any():
+        row = int(np.flatnonzero(too_far)[0])
         projection = table.keys[row]
         shift_cols = shifts[row, 0]
         shift_rows = shifts[row, 1]
@@ -188,10 +189,19 @@ def poses_of(scan: SelectedScan, frames: I64) -> ScanPoses | None:
             "detector."
         )
     n = len(source.table)
-    every = np.full((n, 4), np.nan)
-    every[rows >= 0] = np.column_stack((shifts, np.radians(table.turns_deg)))[rows[rows >= 0]]
+    pose_of_frame = np.full((n, 4), np.nan)
+    pose_of_frame[rows >= 0] = np.column_stack((shifts, np.radians(table.turns_deg)))[rows[rows >= 0]]
     pivot, sentence = selection.pivot, _sentence(table, shifts)
-    poses = ScanPoses(table, every[:, :2], every[:, 2], every[:, 3], frames, sentence, pivot, selection.binning)
+    poses = ScanPoses(
+        table,
+        pose_of_frame[:, :2],
+        pose_of_frame[:, 2],
+        pose_of_frame[:, 3],
+        frames,
+        sentence,
+        pivot,
+        selection.binning,
+    )
     if table.vectors is None:
         return poses
     return replace(poses, vectors=_of_vectors(table, scan), view_of=rows)
@@ -225,7 +235,7 @@ def _of_vectors(table: PoseTable, scan: SelectedScan) -> Geometry:
     return views.rows(rows.start, rows.stop).binned(selection.binning)
 
 
-def _pixels(table: PoseTable, scan: SelectedScan) -> float:
+def _pixels_per_unit(table: PoseTable, scan: SelectedScan) -> float:
     """Size of a pixel of the unbinned detector in the unit of the table."""
     if table.unit == "px":
         return 1.0
@@ -243,7 +253,7 @@ def _pixels(table: PoseTable, scan: SelectedScan) -> float:
     return 1 / size
 
 
-def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
+def _rows_of_frames(table: PoseTable, source: ScanSource, frames: I64) -> I64:
     """[frame of the scan] row of the frame in the table; -1: the table has no such row. If the scan and the table both
     state an angle, the angles must agree.
     """
@@ -254,30 +264,30 @@ def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
         )
     row_of_frame, degrees = np.full(n, -1, np.int64), np.degrees(source.table.angles)
     distances = np.diff(np.unique(np.round(degrees[frames], 9)))
-    tolerance = _OFF * (float(np.median(distances)) if distances.size else 1.0)
+    tolerance = _ANGLE_TOLERANCE * (float(np.median(distances)) if distances.size else 1.0)
     if table.by == "angle_deg":
         order = np.argsort(table.keys)
-        ordered = table.keys[order]
-        right = np.clip(np.searchsorted(ordered, degrees[views]), 0, ordered.size - 1)
+        sorted_degrees = table.keys[order]
+        right = np.clip(np.searchsorted(sorted_degrees, degrees[views]), 0, sorted_degrees.size - 1)
         left = np.maximum(right - 1, 0)
         angles = degrees[views]
-        nearest = np.where(np.abs(ordered[left] - angles) < np.abs(ordered[right] - angles), left, right)
-        close = np.abs(ordered[nearest] - angles) <= tolerance
-        row_of_frame[views[close]] = order[nearest[close]]
+        nearest = np.where(np.abs(sorted_degrees[left] - angles) < np.abs(sorted_degrees[right] - angles), left, right)
+        agrees = np.abs(sorted_degrees[nearest] - angles) <= tolerance
+        row_of_frame[views[agrees]] = order[nearest[agrees]]
     else:
-        into = views if table.by == "view" else np.arange(n)
-        if (beyond := table.keys >= into.size).any():
+        frame_of_key = views if table.by == "view" else np.arange(n)
+        if (beyond := table.keys >= frame_of_key.size).any():
             number = table.keys[beyond][0]
             raise DataError(
-                f"{table.path} states {table.by} {number:g}, but {source.path} has {into.size} {table.by}s, counted "
-                "from 0."
+                f"{table.path} states {table.by} {number:g}, but {source.path} has {frame_of_key.size} {table.by}s, "
+                "counted from 0."
             )
-        row_of_frame[into[table.keys.astype(np.int64)]] = np.arange(table.keys.size)
+        row_of_frame[frame_of_key[table.keys.astype(np.int64)]] = np.arange(table.keys.size)
         if table.angles_deg is not None:
-            both = frames[row_of_frame[frames] >= 0]
-            off = np.abs(table.angles_deg[row_of_frame[both]] - degrees[both])
-            if (off > tolerance).any():
-                frame = int(both[off > tolerance][0])
+            stated_twice = frames[row_of_frame[frames] >= 0]
+            differences = np.abs(table.angles_deg[row_of_frame[stated_twice]] - degrees[stated_twice])
+            if (differences > tolerance).any():
+                frame = int(stated_twice[differences > tolerance][0])
                 stated = table.angles_deg[row_of_frame[frame]]
                 scan_degrees = degrees[frame]
                 raise DataError(

@@ -128,13 +128,13 @@ class Width:
                     f"{table.path}, which cannot describe a rotation during the exposure."
                 )
         parameters: dict[str, Value] = {}
-        reach, rows = geometry.reach / geometry.sample_pitch * selection.binning, source.shape[0]
+        reach_px, rows = geometry.reach / geometry.sample_pitch * selection.binning, source.shape[0]
         if stated is not None:
-            leaning = not geometry.is_straight or any(step.may_lean for step in geometry_steps(selection))
-            bent = geometry.is_cone or leaning
+            tilted = not geometry.is_straight or any(step.may_roll_or_tilt for step in geometry_steps(selection))
+            rows_differ = geometry.is_cone or tilted
             if self.arc != "auto":
                 motion = stated
-                if bent and stated.skew:
+                if rows_differ and stated.skew:
                     found = (
                         "the beam is a cone"
                         if geometry.is_cone
@@ -144,23 +144,23 @@ class Width:
                         f"Use --exposure-arc {self.arc.split(':')[0]} instead of {self.arc}: the readout arc (after "
                         f"the colon) needs a parallel beam without roll or tilt, but {found}. Nothing was written."
                     )
-            elif abs(stated.arc) * reach >= _LEAST_PX:
-                motion = _Motion(stated.arc, 0.0 if bent else stated.skew)
+            elif abs(stated.arc) * reach_px >= _LEAST_PX:
+                motion = _Motion(stated.arc, 0.0 if rows_differ else stated.skew)
             # the arc is too short to be modelled, but the angles are still those of the middle of the exposure
             elif stated.arc:
                 geometry = replace(geometry, angles=geometry.angles + stated.arc / 2)
                 parameters["middle_of_exposure_deg"] = math.degrees(stated.arc / 2)
         if not (width or any(motion)):
             return geometry, StepDone(parameters=parameters)
-        first = (selection.rows or (0, 0))[0] + (selection.binning - 1) / 2
-        exposed_geometry = replace(geometry, angles=geometry.angles + motion.arc / 2 + motion.skew * first)
+        first_row = (selection.rows or (0, 0))[0] + (selection.binning - 1) / 2
+        exposed_geometry = replace(geometry, angles=geometry.angles + motion.arc / 2 + motion.skew * first_row)
         exposed_geometry = exposed_geometry.seen_with(
             replace(width, arc=abs(motion.arc)), motion.skew * selection.binning
         )
         exposure_degrees, readout_degrees = math.degrees(abs(motion.arc)), math.degrees(motion.skew * (rows - 1))
         statements = [
             *([f"each ray has the area of a pixel{f' and a blur of {blur:g} px' if blur else ''}"] if width else []),
-            *([f"a projection is the mean over {exposure_degrees:.3g} degrees ({abs(motion.arc) * reach:.2g} px at "
+            *([f"a projection is the mean over {exposure_degrees:.3g} degrees ({abs(motion.arc) * reach_px:.2g} px at "
                 "the edge of the field of view)"] if motion.arc else []),
             *([f"the last detector row is exposed {readout_degrees:.2g} degrees later than the first"]
               if motion.skew else []),
@@ -176,8 +176,8 @@ class Width:
             return None
         if self.arc != "auto":
             arc, skew = ([math.radians(float(part)) for part in self.arc.split(":")] + [0.0])[:2]
-            sense = -1.0 if _step(source.table.angles[source.table.views]) < 0 else 1.0
-            return _Motion(sense * arc, sense * skew / max(source.shape[0] - 1, 1))
+            direction = -1.0 if _step(source.table.angles[source.table.views]) < 0 else 1.0
+            return _Motion(direction * arc, direction * skew / max(source.shape[0] - 1, 1))
         return stated_motion(source)
 
 

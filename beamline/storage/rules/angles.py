@@ -66,10 +66,10 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
         )
         return
     step = span / (distinct.size - 1)
-    if (text := _no_degrees(angles, distinct)) is not None:
+    if (text := _why_not_degrees(angles, distinct)) is not None:
         # A plan belongs to a scan of this program, whose angles are in degrees.
         yield Finding("warning" if scan.source.plan else "error", "angle-spread", text)
-    elif (unseen := half_turn_unseen(angles)) > 0:
+    elif (unseen := degrees_without_projection(angles)) > 0:
         span_text = f"span {span:.2f} degrees, less than 180" if span + step < 180 else "do not cover 180 degrees"
         yield Finding(
             "warning",
@@ -93,11 +93,11 @@ def directions(angles: NDArray[np.float64]) -> int:
     """The directions of the rays of parallel projections [view], in rad. Projections that are 180 degrees apart have
     the same direction.
     """
-    half = np.mod(np.degrees(angles), 180.0)
-    return int(np.unique(np.round(np.where(half > 180.0 - _EQUAL, 0.0, half) / _EQUAL)).size)
+    degrees = np.mod(np.degrees(angles), 180.0)
+    return int(np.unique(np.round(np.where(degrees > 180.0 - _EQUAL, 0.0, degrees) / _EQUAL)).size)
 
 
-def half_turn_unseen(angles: NDArray[np.float64]) -> float:
+def degrees_without_projection(angles: NDArray[np.float64]) -> float:
     """How much of the 180 degrees has no projection, beyond the normal spacing of the projections: the largest gap, or
     all gaps together. `angles` are [view], in rad.
 
@@ -109,25 +109,25 @@ def half_turn_unseen(angles: NDArray[np.float64]) -> float:
     allowed gap is exceeded by 2 in 1000 scans with 45 or more projections, and by 1 in 100 scans with ten projections.
     If the angles are evenly spaced, a gap that is larger than the others by half a degree is reported.
     """
-    places = np.sort(np.mod(np.degrees(angles), 180.0))
-    gaps = np.diff(places, append=places[0] + 180.0)
-    gaps = gaps[gaps > _SAME * 180.0 / places.size]  # neighbouring projections count as one
+    sorted_degrees = np.sort(np.mod(np.degrees(angles), 180.0))
+    gaps = np.diff(sorted_degrees, append=sorted_degrees[0] + 180.0)
+    gaps = gaps[gaps > _SAME * 180.0 / sorted_degrees.size]  # neighbouring projections count as one
     if gaps.size < 2:
         return 180.0
-    *others, second, largest = np.sort(gaps)
-    uneven = float(np.std([*others, second])) / _OF_MEAN
-    n = len(others) + 1
+    *smaller, second, largest = np.sort(gaps)
+    mean_gap = float(np.std([*smaller, second])) / _OF_MEAN
+    n = len(smaller) + 1
     # 6.9 mean gaps, if the mean gap is known; more if it is estimated from n gaps
-    times = n * (_FALSE_ALARM ** (-1 / n) - 1)
-    limit = second + max(_GAP, times * uneven)
+    factor = n * (_FALSE_ALARM ** (-1 / n) - 1)
+    limit = second + max(_GAP, factor * mean_gap)
     if not np.isclose(largest, 180.0 - np.ptp(np.degrees(angles)), atol=_GAP):
         # only between the first and the last projection: a single lost projection is not a missing wedge
         limit = max(limit, 2 * float(np.median(gaps)) + _GAP)
-    unweighed = 180.0 - float(np.degrees(angular_weights(angles).sum()))
-    return max(float(largest) if largest > limit else 0.0, unweighed if unweighed > _UNWEIGHED else 0.0)
+    without_weight = 180.0 - float(np.degrees(angular_weights(angles).sum()))
+    return max(float(largest) if largest > limit else 0.0, without_weight if without_weight > _UNWEIGHED else 0.0)
 
 
-def _no_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64]) -> str | None:
+def _why_not_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64]) -> str | None:
     """A sentence that says why angles [view], which were read as degrees and converted to rad, cannot have been in
     degrees. None if they can.
 

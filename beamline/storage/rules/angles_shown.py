@@ -70,66 +70,68 @@ class CoarseViews:
 
     def _lines(self, row: int) -> NDArray[np.float64]:
         cells = self.scan.frame(row).places
-        if self.scan.beam is None:
+        if self.scan.dark_and_flat is None:
             return np.nan_to_num(cells.astype(np.float64))
-        dark, flat = self.scan.beam
+        dark, flat = self.scan.dark_and_flat
         beam = np.nan_to_num(flat - dark)
         least = _LEAST_INTENSITY * max(float(beam.max()), 1e-30)
-        seen = np.nan_to_num(cells - dark)
-        return np.asarray(-np.log(np.maximum(seen, least) / np.maximum(beam, least)), np.float64)
+        intensity = np.nan_to_num(cells - dark)
+        return np.asarray(-np.log(np.maximum(intensity, least) / np.maximum(beam, least)), np.float64)
 
-    def _is_lit(self, row: int) -> bool:
-        if self.scan.beam is None:
+    def _has_beam(self, row: int) -> bool:
+        if self.scan.dark_and_flat is None:
             return bool(np.ptp(self._lines(row)))
-        cells, (dark, flat) = self.scan.frame(row).places, self.scan.beam
+        cells, (dark, flat) = self.scan.frame(row).places, self.scan.dark_and_flat
         # something that is opaque from top to bottom is not part of the sample
-        if (lit := lit_places(flat - dark)).any():
-            posts = ((cells - dark < DARK * (flat - dark)) | ~lit).all(axis=0) & lit.any(axis=0)
+        if (bright := lit_places(flat - dark)).any():
+            posts = ((cells - dark < DARK * (flat - dark)) | ~bright).all(axis=0) & bright.any(axis=0)
             if posts.any():
                 return False
-        return brightness(cells, dark, flat) > LEAST * self.scan.light.brightest
+        return brightness(cells, dark, flat) > LEAST * self.scan.illumination.brightest
 
-    def lit(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def with_beam(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
         """bool [view], True if the projection has beam and shows a sample."""
-        return np.array([self._is_lit(row) for row in rows.tolist()], np.bool_)
+        return np.array([self._has_beam(row) for row in rows.tolist()], np.bool_)
 
-    def lit_pairs(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[Pair]:
+    def pairs_with_beam(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[Pair]:
         """A few of the pairs of projections, evenly spread. Both projections of a pair have beam."""
-        some = spread(np.arange(first.size), PAIRS)
-        some = some[self.lit(first[some]) & self.lit(second[some])]
-        return list(zip(first[some].tolist(), second[some].tolist(), strict=True))
+        chosen = spread(np.arange(first.size), PAIRS)
+        chosen = chosen[self.with_beam(first[chosen]) & self.with_beam(second[chosen])]
+        return list(zip(first[chosen].tolist(), second[chosen].tolist(), strict=True))
 
-    def unlike(self, pair: Pair, mirrored: bool = False) -> float:
+    def mismatch(self, pair: Pair, mirrored: bool = False) -> float:
         """1 minus the correlation of two projections. To compare mirror images, the second projection is mirrored about
         the column with the best agreement. This column is searched for in the middle half of the detector. If the best
         column is at the edge of this half, the whole width is searched.
         """
-        one, other = self.depth(pair[0]), self.depth(pair[1])
+        first, second = self.depth(pair[0]), self.depth(pair[1])
         if not mirrored:
-            power = float(np.linalg.norm(one) * np.linalg.norm(other))
-            return 1 - float((one * other).sum()) / power if power > 0 else 1.0
-        places = np.arange(0, one.shape[1] - 0.9, 0.5)  # half columns, because edges are sharp
-        one, other = (np.stack([np.interp(places, places[::2], row) for row in image]) for image in (one, other))
-        cols = one.shape[1]
+            norm = float(np.linalg.norm(first) * np.linalg.norm(second))
+            return 1 - float((first * second).sum()) / norm if norm > 0 else 1.0
+        half_cols = np.arange(0, first.shape[1] - 0.9, 0.5)  # half columns, because edges are sharp
+        first, second = (
+            np.stack([np.interp(half_cols, half_cols[::2], row) for row in image]) for image in (first, second)
+        )
+        cols = first.shape[1]
         for reach in (cols // 4, cols // 2):
-            curve = mirror_mismatch(one, other, (cols - 1 + np.arange(-reach, reach + 1)) / 2)
+            curve = mirror_mismatch(first, second, (cols - 1 + np.arange(-reach, reach + 1)) / 2)
             lowest = int(np.argmin(curve))
             if 0 < lowest < 2 * reach:
                 below, here, above = curve[lowest - 1 : lowest + 2]
                 return max(float(here - (below - above) ** 2 / 8 / max(below - 2 * here + above, 1e-12)), 0.0)
         return float(curve.min())
 
-    def all_unlike(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """[view, view] `unlike` for each pair of these projections."""
+    def mismatches(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """[view, view] `mismatch` for each pair of these projections."""
         depths = np.stack([self.depth(row).ravel() for row in rows.tolist()])
         norms = np.array([np.linalg.norm(depth) for depth in depths])
         products = np.stack([(depth * depths).sum(axis=1) for depth in depths])
         powers = np.multiply.outer(norms, norms)
         return 1 - np.divide(products, powers, out=np.zeros_like(powers), where=powers > 0)
 
-    def typical(self, pairs: Sequence[Pair]) -> float:
-        """Median of `unlike` over the pairs."""
-        return float(np.median([self.unlike(pair) for pair in pairs]))
+    def typical_mismatch(self, pairs: Sequence[Pair]) -> float:
+        """Median of `mismatch` over the pairs."""
+        return float(np.median([self.mismatch(pair) for pair in pairs]))
 
 
 def coarse_views(scan: ScanEvidence) -> CoarseViews | None:
@@ -139,39 +141,40 @@ def coarse_views(scan: ScanEvidence) -> CoarseViews | None:
     views = scan.table.views_with_angles
     if scan.source.quantity == "unknown" or scan.table.shifts is not None:
         return None
-    lacking = scan.in_counts and not scan.table.has(FrameKind.DARK, FrameKind.FLAT)
-    if lacking or min(scan.source.shape[1], views.size) < _LEAST_SEEN:
+    references_missing = scan.in_counts and not scan.table.has(FrameKind.DARK, FrameKind.FLAT)
+    if references_missing or min(scan.source.shape[1], views.size) < _LEAST_SEEN:
         return None
-    _ = scan.light.brightest  # some of these frames may turn out to be unreadable
+    _ = scan.illumination.brightest  # some of these frames may turn out to be unreadable
     views = np.array([row for row in views.tolist() if row not in scan.source.unreadable], np.int64)
     return CoarseViews(scan, views, np.degrees(scan.table.angles)) if views.size >= _LEAST_SEEN else None
 
 
 def angles_shown(scan: ScanEvidence) -> Iterator[Finding]:
     """The projections agree with the rotation and with the order of angles that the file states."""
-    if (seen := coarse_views(scan)) is not None:
-        yield from angles_stand(seen)
-        yield from angles_seen(seen)
-        yield from angles_in_order(seen)
+    if (coarse := coarse_views(scan)) is not None:
+        yield from stage_stands_still(coarse)
+        yield from rotation_matches_images(coarse)
+        yield from angles_in_order(coarse)
 
 
-def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
+def stage_stands_still(coarse: CoarseViews) -> Iterator[Finding]:
     """Consecutive frames with the same stated angle look the same, as frames do that are to be averaged.
 
     If the stage kept rotating, the last frame differs from the first one by more than neighbouring frames do: the
     squared difference grows with the square of the rotation.
     """
-    degrees = seen.degrees[seen.rows]
+    degrees = coarse.degrees[coarse.rows]
     starts = np.flatnonzero(np.diff(degrees, prepend=np.nan) != 0)
     lengths = np.diff(starts, append=degrees.size)
     runs = spread(np.flatnonzero(lengths >= _STANDS), PAIRS)
-    first, second, last = (seen.rows[starts[runs] + later] for later in (0, 1, lengths[runs] - 1))
-    if not runs.size or not (seen.lit(first) & seen.lit(last)).all():
+    first, second, last = (coarse.rows[starts[runs] + offset] for offset in (0, 1, lengths[runs] - 1))
+    if not runs.size or not (coarse.with_beam(first) & coarse.with_beam(last)).all():
         return
-    beside, across = (
-        max(_EQUAL, seen.typical(list(zip(first.tolist(), later.tolist(), strict=True)))) for later in (second, last)
+    neighbour_mismatch, end_mismatch = (
+        max(_EQUAL, coarse.typical_mismatch(list(zip(first.tolist(), frames.tolist(), strict=True))))
+        for frames in (second, last)
     )
-    if across > _TURNED * beside:
+    if end_mismatch > _TURNED * neighbour_mismatch:
         n = int(np.median(lengths[lengths >= _STANDS]))
         first_of_each = (
             f" Or use the first projection of each angle: --frames 0::{n}." if (lengths[:-1] == n).all() else ""
@@ -179,8 +182,8 @@ def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
         one_frame = first[0]
         other_frame = last[0]
         start = degrees[0]
-        stated_degrees = seen.degrees[first[0]]
-        times = across / beside
+        stated_degrees = coarse.degrees[first[0]]
+        times = end_mismatch / neighbour_mismatch
         yield Finding(
             "warning",
             "angle-spread",
@@ -192,38 +195,40 @@ def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
         )
 
 
-def angles_seen(seen: CoarseViews) -> Iterator[Finding]:
+def rotation_matches_images(coarse: CoarseViews) -> Iterator[Finding]:
     """Parallel projections are mirror images if, and only if, their angles are 180 degrees apart.
 
     A ray measures the same from both sides. This is true for any sample, even one that is wider than the field of view.
     The difference between neighbouring projections shows how a rotation, and noise, changes the projections of this
     sample: a round sample looks the same at all angles.
     """
-    if seen.scan.cone is not None:
+    if coarse.scan.cone is not None:
         return
-    views = seen.rows[np.argsort(seen.degrees[seen.rows], kind="stable")]
-    some = _some_lit(seen, views)
-    stated = seen.degrees[some]
+    views = coarse.rows[np.argsort(coarse.degrees[coarse.rows], kind="stable")]
+    sampled = _sampled_with_beam(coarse, views)
+    stated = coarse.degrees[sampled]
     if np.unique(stated).size < _LEAST_SEEN:
         return
-    apart = max(np.ptp(stated) / _FINE, float(np.median(np.diff(np.unique(seen.degrees[views])))))
-    beside = _nearest(seen, views, stated + apart)
-    chosen = spread(np.flatnonzero(beside != some), PAIRS)
+    small_rotation = max(np.ptp(stated) / _FINE, float(np.median(np.diff(np.unique(coarse.degrees[views])))))
+    neighbours = _nearest(coarse, views, stated + small_rotation)
+    chosen = spread(np.flatnonzero(neighbours != sampled), PAIRS)
     if not chosen.size:
         return
-    near = seen.typical(list(zip(some[chosen].tolist(), beside[chosen].tolist(), strict=True)))
-    if (turn := _turn_seen(seen, views, some, near)) is not None:
-        yield _angles_finding(seen.scan, seen.degrees[views], turn)
+    neighbour_mismatch = coarse.typical_mismatch(
+        list(zip(sampled[chosen].tolist(), neighbours[chosen].tolist(), strict=True))
+    )
+    if (turn := _mirror_images(coarse, views, sampled, neighbour_mismatch)) is not None:
+        yield _angles_finding(coarse.scan, coarse.degrees[views], turn)
 
 
-def _some_lit(seen: CoarseViews, views: NDArray[np.int64]) -> NDArray[np.int64]:
-    some = spread(views, VIEWS)
-    return some[seen.lit(some)]
+def _sampled_with_beam(coarse: CoarseViews, views: NDArray[np.int64]) -> NDArray[np.int64]:
+    sampled = spread(views, VIEWS)
+    return sampled[coarse.with_beam(sampled)]
 
 
-def _nearest(seen: CoarseViews, views: NDArray[np.int64], degrees: NDArray[np.float64]) -> NDArray[np.int64]:
+def _nearest(coarse: CoarseViews, views: NDArray[np.int64], degrees: NDArray[np.float64]) -> NDArray[np.int64]:
     """The projection whose stated angle is nearest to each of these angles."""
-    return views[np.abs(seen.degrees[views] - degrees[:, None]).argmin(axis=1)]
+    return views[np.abs(coarse.degrees[views] - degrees[:, None]).argmin(axis=1)]
 
 
 @dataclass(frozen=True)
@@ -237,41 +242,45 @@ class _Turn:
     stated: Pair | None
 
 
-def _turn_seen(seen: CoarseViews, views: NDArray[np.int64], some: NDArray[np.int64], near: float) -> _Turn | None:
+def _mirror_images(
+    coarse: CoarseViews, views: NDArray[np.int64], sampled: NDArray[np.int64], neighbour_mismatch: float
+) -> _Turn | None:
     """Pairs of projections that look the same after a wrong angle, if those that should look the same do not.
 
     Args:
-        views, some: all projections, and some of them, by ascending angle.
-        near: how much the neighbours of the selected projections differ.
+        views, sampled: all projections, and some of them, by ascending angle.
+        neighbour_mismatch: how much the neighbours of the selected projections differ.
     """
-    degrees = seen.degrees
-    step = float(np.ptp(degrees[some])) / (some.size - 1)
-    partner = _nearest(seen, views, degrees[some] + 180)
-    within = min(float(np.median(np.diff(np.unique(degrees[views])))), step)
-    pairs = np.abs(degrees[partner] - degrees[some] - 180) <= within
-    stated = seen.lit_pairs(some[pairs], partner[pairs])
+    degrees = coarse.degrees
+    step = float(np.ptp(degrees[sampled])) / (sampled.size - 1)
+    partner = _nearest(coarse, views, degrees[sampled] + 180)
+    pair_tolerance = min(float(np.median(np.diff(np.unique(degrees[views])))), step)
+    pairs = np.abs(degrees[partner] - degrees[sampled] - 180) <= pair_tolerance
+    stated = coarse.pairs_with_beam(sampled[pairs], partner[pairs])
     # The most similar pairs decide: a loose particle makes one pair different, wrong angles make all pairs different.
-    off = min((seen.unlike(pair, mirrored=True) for pair in stated), default=np.inf)
-    if off < 2 * UNLIKE * near:
+    stated_mismatch = min((coarse.mismatch(pair, mirrored=True) for pair in stated), default=np.inf)
+    if stated_mismatch < 2 * UNLIKE * neighbour_mismatch:
         return None
-    first, last, quarter = int(some[0]), int(some[-1]), some.size // 4
-    ends = [(first, row) for row in some[quarter:].tolist()] + [(last, row) for row in some[1:-quarter].tolist()]
-    differences = np.array([seen.unlike(pair, mirrored=True) for pair in ends])
-    usual, (end, moved) = float(np.median(differences)), ends[int(np.argmin(differences))]
-    around = spread(views[(np.abs(degrees[views] - degrees[moved]) < step) & (views != end)], _AROUND).tolist()
-    best, nearest = min((seen.unlike((end, row), mirrored=True), row) for row in around)
-    turned, right = abs(float(degrees[nearest] - degrees[end])), max(OTHER * 180, 2 * step)
-    apart = np.array([abs(degrees[second] - degrees[first]) for first, second in ends])
-    off = min([off, *differences[np.abs(apart - 180) <= right]])
-    if abs(turned - 180) <= right or not best < min(2 * near, off / UNLIKE, usual / UNLIKE):
+    first, last, quarter = int(sampled[0]), int(sampled[-1]), sampled.size // 4
+    ends = [(first, row) for row in sampled[quarter:].tolist()] + [(last, row) for row in sampled[1:-quarter].tolist()]
+    differences = np.array([coarse.mismatch(pair, mirrored=True) for pair in ends])
+    usual_mismatch, (end, similar) = float(np.median(differences)), ends[int(np.argmin(differences))]
+    around = spread(views[(np.abs(degrees[views] - degrees[similar]) < step) & (views != end)], _AROUND).tolist()
+    best, nearest = min((coarse.mismatch((end, row), mirrored=True), row) for row in around)
+    rotation, tolerance = abs(float(degrees[nearest] - degrees[end])), max(OTHER * 180, 2 * step)
+    distances = np.array([abs(degrees[second] - degrees[first]) for first, second in ends])
+    stated_mismatch = min([stated_mismatch, *differences[np.abs(distances - 180) <= tolerance]])
+    if abs(rotation - 180) <= tolerance or not best < min(
+        2 * neighbour_mismatch, stated_mismatch / UNLIKE, usual_mismatch / UNLIKE
+    ):
         return None
-    return _Turn((min(end, nearest), max(end, nearest)), turned, stated[len(stated) // 2] if stated else None)
+    return _Turn((min(end, nearest), max(end, nearest)), rotation, stated[len(stated) // 2] if stated else None)
 
 
 def _angles_finding(scan: ScanEvidence, degrees: NDArray[np.float64], turn: _Turn) -> Finding:
-    known = [factor for factor in _FACTORS if abs(turn.degrees - 180 * factor) < np.ptp(degrees) / VIEWS]
-    counted = np.allclose(degrees, np.arange(degrees.size))
-    if counted:
+    known_factors = [factor for factor in _FACTORS if abs(turn.degrees - 180 * factor) < np.ptp(degrees) / VIEWS]
+    counts_up = np.allclose(degrees, np.arange(degrees.size))
+    if counts_up:
         unit = "the values are 0, 1, 2 and so on, so they are frame numbers"
     else:
         times = 180 / turn.degrees
@@ -289,84 +298,94 @@ def _angles_finding(scan: ScanEvidence, degrees: NDArray[np.float64], turn: _Tur
     # A plan belongs to a scan of this program, whose angles are in degrees. If no projections have stated angles 180
     # degrees apart, a symmetric sample may look the same, too. Mistakes are by one of these factors, while a moving
     # sample may repeat after any angle.
-    sure = not scan.source.plan and turn.stated is not None and (counted or bool(known))
-    which = "The" if sure else "Unless the sample moved or is symmetric, the"
+    certain = not scan.source.plan and turn.stated is not None and (counts_up or bool(known_factors))
+    which = "The" if certain else "Unless the sample moved or is symmetric, the"
     return Finding(
-        "error" if sure else "warning",
+        "error" if certain else "warning",
         "angle-spread",
         f"{pairs}. {which} angles are not in degrees: {unit}. Give the angles in degrees with --angles FILE (one per "
         "line).",
     )
 
 
-def angles_in_order(seen: CoarseViews) -> Iterator[Finding]:
+def angles_in_order(coarse: CoarseViews) -> Iterator[Finding]:
     """Consecutive frames look similar only if their angles are close, and close angles look similar.
 
     The rule finds a list of angles in another order than the frames, and single wrong angles. If the list is shifted,
     this is visible only where the angles jump, so the rule checks these places.
     """
-    rows, degrees = seen.rows, seen.degrees[seen.rows] % 360
+    rows, degrees = coarse.rows, coarse.degrees[coarse.rows] % 360
     order = np.argsort(degrees, kind="stable")
     gaps = np.diff(degrees[order])
     if not (gaps > 0).any():
         return
     step = float(np.median(gaps[gaps > 0]))
     jumps = np.flatnonzero(np.abs((np.diff(degrees) + 180) % 360 - 180) > _FAR * step)
-    beside = np.flatnonzero((gaps <= _NEXT * step) & (np.abs(np.diff(order)) > 1))
-    far = seen.lit_pairs(rows[jumps], rows[jumps + 1])
-    near = seen.lit_pairs(rows[order[beside]], rows[order[beside + 1]])
-    if far and near and seen.typical(near) > UNLIKE * seen.typical(far):
-        yield _in_another_order(seen, jumps, far[0], near[0])
-    elif (elsewhere := _alike_elsewhere(seen, rows[order])) is not None:
-        yield elsewhere
+    close = np.flatnonzero((gaps <= _NEXT * step) & (np.abs(np.diff(order)) > 1))
+    distant_pairs = coarse.pairs_with_beam(rows[jumps], rows[jumps + 1])
+    close_pairs = coarse.pairs_with_beam(rows[order[close]], rows[order[close + 1]])
+    if (
+        distant_pairs
+        and close_pairs
+        and coarse.typical_mismatch(close_pairs) > UNLIKE * coarse.typical_mismatch(distant_pairs)
+    ):
+        yield _in_another_order(coarse, jumps, distant_pairs[0], close_pairs[0])
+    elif (finding := _alike_elsewhere(coarse, rows[order])) is not None:
+        yield finding
 
 
-def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Finding | None:
+def _alike_elsewhere(coarse: CoarseViews, rows: NDArray[np.int64]) -> Finding | None:
     """True if most projections look more like a distant projection than like their neighbours. `rows` are in ascending
     order of angle.
 
     Test on two measured scans (the tooth, Diamond) that were reordered as if taken in 2, 3, 4 and 6 passes: the rule
     finds 5 of these 8, but not the two with 2 passes. In the original order it reports neither scan.
     """
-    some = _some_lit(seen, rows)
-    if some.size < PAIRS:
+    sampled = _sampled_with_beam(coarse, rows)
+    if sampled.size < PAIRS:
         return None
-    degrees = seen.degrees[some] % 360
-    unlike = seen.all_unlike(some)
-    apart = np.abs((degrees - degrees[:, None] + 180) % 360 - 180)
-    far = np.where(apart > max(OTHER * 180, 2 * float(np.median(np.diff(degrees)))), unlike, np.nan)
-    if not np.isfinite(far).any():
+    degrees = coarse.degrees[sampled] % 360
+    mismatch = coarse.mismatches(sampled)
+    distances = np.abs((degrees - degrees[:, None] + 180) % 360 - 180)
+    distant_mismatches = np.where(
+        distances > max(OTHER * 180, 2 * float(np.median(np.diff(degrees)))), mismatch, np.nan
+    )
+    if not np.isfinite(distant_mismatches).any():
         return None
-    usual, beside = float(np.nanmedian(far)), np.diagonal(unlike, 1)
-    far = np.nan_to_num(far, nan=np.inf)
-    like, neighbours = far.argmin(axis=1), np.minimum(np.append(beside, np.inf), np.append(np.inf, beside))
-    odd = far.min(axis=1) < np.minimum(neighbours, usual / UNLIKE)
+    usual_mismatch, next_mismatches = float(np.nanmedian(distant_mismatches)), np.diagonal(mismatch, 1)
+    distant_mismatches = np.nan_to_num(distant_mismatches, nan=np.inf)
+    most_similar, neighbour_mismatches = (
+        distant_mismatches.argmin(axis=1),
+        np.minimum(np.append(next_mismatches, np.inf), np.append(np.inf, next_mismatches)),
+    )
+    misplaced = distant_mismatches.min(axis=1) < np.minimum(neighbour_mismatches, usual_mismatch / UNLIKE)
     # A sample with a plane of symmetry looks the same from directions that mirror each other: the sums of such
     # directions are equal.
-    sums = np.radians(degrees[odd] + degrees[like[odd]])
-    if odd.mean() < _MOST or abs(np.exp(1j * sums).mean()) > _MIRRORED:
+    sums = np.radians(degrees[misplaced] + degrees[most_similar[misplaced]])
+    if misplaced.mean() < _MOST or abs(np.exp(1j * sums).mean()) > _MIRRORED:
         return None
-    first = int(np.flatnonzero(odd)[0])
+    first = int(np.flatnonzero(misplaced)[0])
+    pair = int(sampled[first]), int(sampled[most_similar[first]])
     return Finding(
         "warning",
         ORDER,
-        f"{_stated(seen, (int(some[first]), int(some[like[first]])))} look more similar than neighbours do. "
-        f"{odd.sum()} of the {some.size} compared projections look like a projection at a distant angle. If the "
+        f"{_stated(coarse, pair)} look more similar than neighbours do. {misplaced.sum()} of the {sampled.size} "
+        "compared projections look like a projection at a distant angle. If the "
         "sample is not symmetric, either the angles are not in the order of the frames, or the sample rotated "
         "further than the angles state.",
     )
 
 
-def _stated(seen: CoarseViews, pair: Pair) -> str:
-    first, second = seen.degrees[list(pair)]
+def _stated(coarse: CoarseViews, pair: Pair) -> str:
+    first, second = coarse.degrees[list(pair)]
     return f"Frames {pair[0]} and {pair[1]}, stated at {first:.6g} and {second:.6g} degrees,"
 
 
-def _in_another_order(seen: CoarseViews, jumps: NDArray[np.int64], far: Pair, near: Pair) -> Finding:
-    text = f"{_stated(seen, far)} look similar, but f{_stated(seen, near)[1:]} do not. "
+def _in_another_order(coarse: CoarseViews, jumps: NDArray[np.int64], far: Pair, near: Pair) -> Finding:
+    text = f"{_stated(coarse, far)} look similar, but f{_stated(coarse, near)[1:]} do not. "
     single = np.intersect1d(jumps, jumps + 1)  # between two jumps of the angles
-    if single.size and jumps.size == 2 * single.size and single.size <= _SINGLE * seen.rows.size:
-        wrong = ", ".join(f"{row} ({seen.degrees[row]:.6g})" for row in seen.rows[single[:5]].tolist())
+    if single.size and jumps.size == 2 * single.size and single.size <= _SINGLE * coarse.rows.size:
+        wrong = ", ".join(f"{row} ({coarse.degrees[row]:.6g})" for row in coarse.rows[single[:5]].tolist())
         text += (
             f"The angles of {single.size} projections are not between the angles of the neighbouring "
             f"projections: frames {wrong}. "
@@ -376,4 +395,4 @@ def _in_another_order(seen: CoarseViews, jumps: NDArray[np.int64], far: Pair, ne
         "The angles are not in the order of the frames. Give one angle for each projection, in the order of the "
         "projections, with --angles FILE."
     )
-    return Finding("warning" if seen.scan.source.plan else "error", ORDER, text)
+    return Finding("warning" if coarse.scan.source.plan else "error", ORDER, text)

@@ -71,9 +71,9 @@ class ScanEvidence:
     """
 
     source: ScanSource
-    asked: EvidenceRequest = field(default_factory=EvidenceRequest)
+    request: EvidenceRequest = field(default_factory=EvidenceRequest)
     table: FrameTable = field(init=False)
-    _seen: dict[int, FrameStatistics] = field(default_factory=dict)
+    _statistics: dict[int, FrameStatistics] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "table", self.source.table)
@@ -90,31 +90,31 @@ class ScanEvidence:
     @property
     def cone(self) -> tuple[float, float] | None:
         """mm from the source to the rotation axis and to the detector; None for a parallel beam."""
-        return self.source.cone if self.asked.cone is None else self.asked.cone
+        return self.source.cone if self.request.cone is None else self.request.cone
 
     @cached_property
     def flags(self) -> FrameFlags | None:
         """The flags of all frames that count; None: there are no flags."""
-        return self.table.flags if self.asked.judge is None else self.asked.judge(self.source)
+        return self.table.flags if self.request.judge is None else self.request.judge(self.source)
 
     # Darks and flats, by groups
 
     @cached_property
-    def taken(self) -> ReferenceGroups:
+    def all_references(self) -> ReferenceGroups:
         """All groups of references, faulty ones included."""
         return ReferenceGroups(*(groups_of(self.table, kind) for kind in (FrameKind.DARK, FrameKind.FLAT)))
 
     @cached_property
-    def good(self) -> ReferenceGroups:
+    def good_references(self) -> ReferenceGroups:
         """The darks and flats without a fault. If all frames of a kind have a fault, all of them."""
         bad = [row for each in self.findings if each.severity != "error" for row in each.frames]
-        kept = ((np.setdiff1d(group, bad) for group in groups) for groups in self.taken)
-        return ReferenceGroups(*(tuple(group for group in groups if group.size) for groups in kept))
+        good = ((np.setdiff1d(group, bad) for group in groups) for groups in self.all_references)
+        return ReferenceGroups(*(tuple(group for group in groups if group.size) for groups in good))
 
     @property
-    def used(self) -> ReferenceGroups:
+    def used_references(self) -> ReferenceGroups:
         """The darks and flats that are used to correct the projections."""
-        return self.taken if self.asked.accepted else self.good
+        return self.all_references if self.request.accepted else self.good_references
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
@@ -124,26 +124,32 @@ class ScanEvidence:
         """
         if not self.in_counts:
             return ()
-        darks, findings = tuple(self._readable(group) for group in self.taken.darks), dict[Finding, None]()
+        darks, findings = tuple(self._readable(group) for group in self.all_references.darks), dict[Finding, None]()
         for start, end in pairwise([*self.table.part_starts.tolist(), len(self.table)]):
-            flats = [group for group in self.taken.flats if start <= group[0] < end]
-            seen, views = tuple(self._readable(group) for group in flats), self.table.views_of(start, end)
-            if flats or not self.taken.flats:
-                shown = Evidence((*darks, *seen), self._views_beside(views, flats))
-                findings |= dict.fromkeys(reference_findings(shown, self.asked.limits))
-        rows = {row for finding in findings for row in finding.frames}
-        good = {self.table.kind(row) for groups in self.taken for group in groups for row in group if row not in rows}
+            flats = [group for group in self.all_references.flats if start <= group[0] < end]
+            readable_flats, views = tuple(self._readable(group) for group in flats), self.table.views_of(start, end)
+            if flats or not self.all_references.flats:
+                evidence = Evidence((*darks, *readable_flats), self._views_near_flats(views, flats))
+                findings |= dict.fromkeys(reference_findings(evidence, self.request.limits))
+        faulty = {row for finding in findings for row in finding.frames}
+        good = {
+            self.table.kind(row)
+            for groups in self.all_references
+            for group in groups
+            for row in group
+            if row not in faulty
+        }
         return tuple(
             replace(each, severity="warning") if each.frames and self.table.kind(each.frames[0]) in good else each
             for each in findings
         )
 
-    def _views_beside(self, views: I64, flats: list[I64]) -> tuple[FrameStatistics, ...]:
+    def _views_near_flats(self, views: I64, flats: list[I64]) -> tuple[FrameStatistics, ...]:
         """Some projections from the whole part of the scan, and some next to its flats."""
         chosen = set(spread(views, VIEWS).tolist())
         for group in flats:
-            place = int(np.searchsorted(views, group[0]))
-            chosen.update(views[max(place - BESIDE, 0) : place + BESIDE].tolist())
+            position = int(np.searchsorted(views, group[0]))
+            chosen.update(views[max(position - BESIDE, 0) : position + BESIDE].tolist())
         return self._readable(np.array(sorted(chosen), np.int64))
 
     def _readable(self, rows: I64) -> tuple[FrameStatistics, ...]:
@@ -159,31 +165,31 @@ class ScanEvidence:
         The dark with the shortest exposure is used. If the exposures of projections differ, the projections are scaled
         to the usual exposure.
         """
-        frame, groups = self._as_it_is(row), self._darks
-        differ = self.views_differ and groups[0][1].size > 0
-        if not frame.exposure > 0 or not (len(groups) > 1 or differ):
+        frame, groups = self._as_recorded(row), self._darks_by_exposure
+        views_differ = self.views_differ and groups[0][1].size > 0
+        if not frame.exposure > 0 or not (len(groups) > 1 or views_differ):
             return frame
-        usual = self.usual_exposure if differ and frame.kind is FrameKind.PROJECTION else frame.exposure
+        usual = self.usual_exposure if views_differ and frame.kind is FrameKind.PROJECTION else frame.exposure
 
         def levelled(part: str) -> F32:
             darks = [
-                (s, np.mean([getattr(self._as_it_is(dark_row), part) for dark_row in rows.tolist()], axis=0))
-                for s, rows in groups
+                (seconds, np.mean([getattr(self._as_recorded(dark_row), part) for dark_row in rows.tolist()], axis=0))
+                for seconds, rows in groups
             ]
-            own = dark_at(frame.exposure, darks) if len(darks) > 1 else darks[0][1]
-            level = darks[0][1] + (getattr(frame, part) - own) * np.float32(usual / frame.exposure)
+            dark = dark_at(frame.exposure, darks) if len(darks) > 1 else darks[0][1]
+            level = darks[0][1] + (getattr(frame, part) - dark) * np.float32(usual / frame.exposure)
             return np.asarray(level, np.float32)
 
         return replace(frame, blocks=levelled("blocks"), cells=levelled("cells"), exposure=usual)
 
-    def _as_it_is(self, row: int) -> FrameStatistics:
+    def _as_recorded(self, row: int) -> FrameStatistics:
         table = self.table if row < len(self.table) else self.source.table  # the scan is running and has grown
         kind = table.kind(row)
-        if row not in self._seen:
+        if row not in self._statistics:
             image = read_known(self.source, [row])[0]
             has_beam = self.in_counts and kind is not FrameKind.DARK
-            self._seen[row] = look_at(with_borders_filled(image) if has_beam else image, row)
-        return replace(self._seen[row], kind=kind, exposure=float(table.exposures[row]))
+            self._statistics[row] = frame_statistics(with_borders_filled(image) if has_beam else image, row)
+        return replace(self._statistics[row], kind=kind, exposure=float(table.exposures[row]))
 
     def cells(self, rows: I64) -> list[F32]:
         """Yields the cells of some frames."""
@@ -192,16 +198,16 @@ class ScanEvidence:
     def mean_cells(self, rows: I64) -> F32:
         """Cells of the mean over the readable frames."""
         cells = dict(zip(rows.tolist(), self.cells(rows), strict=True))
-        known = [cells[row] for row in cells if row not in self.source.unreadable] or list(cells.values())
-        return np.asarray(np.nan_to_num(np.mean(known, axis=0)), np.float32)
+        readable = [cells[row] for row in cells if row not in self.source.unreadable] or list(cells.values())
+        return np.asarray(np.nan_to_num(np.mean(readable, axis=0)), np.float32)
 
     # Exposures
 
     @cached_property
     def usual_exposure(self) -> float:
         """The median exposure of the projections in s; NaN if it is unknown."""
-        of_views = self.table.exposures[self.table.views]
-        known = of_views[of_views > 0]
+        exposures = self.table.exposures[self.table.views]
+        known = exposures[exposures > 0]
         return float(np.median(known)) if known.size else np.nan
 
     @cached_property
@@ -211,7 +217,7 @@ class ScanEvidence:
         return bool(views.size and (views > 0).all() and np.ptp(views) > EXPOSURE_TOLERANCE * np.median(views))
 
     @cached_property
-    def _darks(self) -> list[tuple[float, I64]]:
+    def _darks_by_exposure(self) -> list[tuple[float, I64]]:
         return by_exposure(self.table, self.table.darks)
 
     @cached_property
@@ -227,30 +233,34 @@ class ScanEvidence:
         if not (flats.size and darks.size and self.views_differ):
             return exposures
         dark, flat = (self.mean_cells(rows) for rows in (darks, flats))
-        lit = lit_places(flat - dark)
-        seen = [self.mean_cells(row) for row in spread(views, VIEWS)[:, None]]
-        shares = [np.percentile((cells - dark)[lit] / (flat - dark)[lit], WORST) for cells in seen if lit.any()]
-        most = self.usual_exposure / max(float(np.median(shares)), 1e-30) if shares else 0.0
-        of_views = exposures[views]
-        for each in (of_views.max(), np.median(of_views), of_views.min()):
-            if each <= (1 + DRIFT) * most:
-                return np.where(np.isin(np.arange(len(table)), flats), each, exposures)
+        exposed = lit_places(flat - dark)
+        cells_of_views = [self.mean_cells(row) for row in spread(views, VIEWS)[:, None]]
+        shares = [
+            np.percentile((cells - dark)[exposed] / (flat - dark)[exposed], WORST)
+            for cells in cells_of_views
+            if exposed.any()
+        ]
+        longest = self.usual_exposure / max(float(np.median(shares)), 1e-30) if shares else 0.0
+        view_exposures = exposures[views]
+        for candidate in (view_exposures.max(), np.median(view_exposures), view_exposures.min()):
+            if candidate <= (1 + DRIFT) * longest:
+                return np.where(np.isin(np.arange(len(table)), flats), candidate, exposures)
         return exposures
 
     @cached_property
-    def beam(self) -> tuple[F32, F32] | None:
+    def dark_and_flat(self) -> tuple[F32, F32] | None:
         """Cells [cell row, cell col] of the mean dark and of the mean flat that are used; None if the projections are
         not divided by flats.
         """
-        if not (self.in_counts and all(self.used)):
+        if not (self.in_counts and all(self.used_references)):
             return None
-        dark, flat = (self.mean_cells(np.concatenate(groups)) for groups in self.used)
+        dark, flat = (self.mean_cells(np.concatenate(groups)) for groups in self.used_references)
         return dark, flat
 
     @cached_property
-    def light(self) -> Illumination:
+    def illumination(self) -> Illumination:
         """Which projections have beam."""
-        return Illumination(self.source, self.table.views, self.beam, lambda row: self.frame(row).places)
+        return Illumination(self.source, self.table.views, self.dark_and_flat, lambda row: self.frame(row).places)
 
 
 def groups_of(table: FrameTable, kind: FrameKind) -> tuple[I64, ...]:
@@ -258,10 +268,10 @@ def groups_of(table: FrameTable, kind: FrameKind) -> tuple[I64, ...]:
     in between.
     """
     rows = table.of_kind(kind)
-    before = np.searchsorted(table.views, rows)
+    group_numbers = np.searchsorted(table.views, rows)
     # neither number decreases, so their sum identifies both
-    before += np.searchsorted(table.part_starts, rows, "right")
-    return tuple(np.split(rows, np.flatnonzero(np.diff(before)) + 1)) if rows.size else ()
+    group_numbers += np.searchsorted(table.part_starts, rows, "right")
+    return tuple(np.split(rows, np.flatnonzero(np.diff(group_numbers)) + 1)) if rows.size else ()
 
 
 def by_exposure(table: FrameTable, rows: I64) -> list[tuple[float, I64]]:
@@ -276,7 +286,7 @@ def by_exposure(table: FrameTable, rows: I64) -> list[tuple[float, I64]]:
     return [(float(np.median(table.exposures[part])), np.sort(part)) for part in np.split(rows[order], edges)]
 
 
-def look_at(image: NDArray[Any], row: int) -> FrameStatistics:
+def frame_statistics(image: NDArray[Any], row: int) -> FrameStatistics:
     """Statistics of an image, with its cells."""
     counts, block = image.dtype.kind in "ui", check_block(image.shape)
     saturated = float(np.mean(image >= full_scale(float(image.max())))) if counts else 0.0

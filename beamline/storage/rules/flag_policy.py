@@ -51,7 +51,7 @@ class FlagPolicy:
     def in_words(self) -> str:
         """A sentence about the flagged projections; empty if no projection is flagged."""
         parts = []
-        for some, verbs in (
+        for chosen, verbs in (
             (self.left_out, (("has an alarm and is", "have an alarm and are"), "left out")),
             (self.halved, (("has a warning and counts", "have a warning and count"), "half")),
             (
@@ -59,8 +59,8 @@ class FlagPolicy:
                 (("is", "are"), "flagged in a region, in which rays have half weight (with an alarm: weight 0)"),
             ),
         ):
-            if n := int(some.sum()):
-                parts.append(f"{n} {verbs[0][n > 1]} {verbs[1]} ({counted(self.flags.of(some).counts())})")
+            if n := int(chosen.sum()):
+                parts.append(f"{n} {verbs[0][n > 1]} {verbs[1]} ({counted(self.flags.of(chosen).counts())})")
         return f"Of {self.views.sum()} projections, {', '.join(parts)}." if parts else ""
 
 
@@ -70,21 +70,23 @@ def flag_policy(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> FlagP
     A projection in which the sample jumped is as good as the projections after it. If the check `opposite` also flagged
     this jump, its flags are not used.
     """
-    jumps = [flags.rows(entry, Level.ALARM) for entry in flags.legend if entry.bit == MotionCheck.bit]
-    jumped = np.concatenate([np.zeros(0, np.int64), *jumps])
+    rows_of_checks = [flags.rows(entry, Level.ALARM) for entry in flags.legend if entry.bit == MotionCheck.bit]
+    jump_rows = np.concatenate([np.zeros(0, np.int64), *rows_of_checks])
     flags = flags.without(MotionCheck.bit)
-    if jumped.size:  # a jump that opposite projections show is handled together with the projections after the jump
+    if jump_rows.size:  # a jump that opposite projections show is handled together with the projections after the jump
         flags = flags.without(OppositeCheck.bit)
     boxes = [
         (frame, box, bool(flags.bits[frame] >> entry.alarm_bit & 1))
         for i, entry in enumerate(flags.legend)
         for frame, box in boxes_of(flags, i, entry, shape)
     ]
-    whole = {frame for frame, box, _ in boxes if box is None}
-    local = flags.flagged & ~np.isin(np.arange(flags.bits.size), list(whole))
-    parts = [(frame, box, alarm) for frame, box, alarm in boxes if box is not None and frame not in whole]
-    left_out, halved = (views & some & ~local for some in (flags.alarmed, flags.flagged & ~flags.alarmed))
-    return FlagPolicy(flags, views, left_out, halved, views & local, jumped, parts)
+    flagged_whole = {frame for frame, box, _ in boxes if box is None}
+    flagged_in_region = flags.flagged & ~np.isin(np.arange(flags.bits.size), list(flagged_whole))
+    parts = [(frame, box, alarm) for frame, box, alarm in boxes if box is not None and frame not in flagged_whole]
+    left_out, halved = (
+        views & chosen & ~flagged_in_region for chosen in (flags.alarmed, flags.flagged & ~flags.alarmed)
+    )
+    return FlagPolicy(flags, views, left_out, halved, views & flagged_in_region, jump_rows, parts)
 
 
 def boxes_of(
@@ -97,18 +99,18 @@ def boxes_of(
     its region is extrapolated along a straight line through the regions of the later projections.
     """
     rows = np.flatnonzero(flags.bits >> entry.bit & 1)
-    for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
-        boxes = flags.regions[run, check].astype(np.float64)
+    for consecutive_rows in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
+        boxes = flags.regions[consecutive_rows, check].astype(np.float64)
         known = boxes[:, 0] >= 0
         if known.any() and not known.all():
-            line = np.polynomial.Polynomial.fit if known.sum() > 1 else None
+            fit = np.polynomial.Polynomial.fit if known.sum() > 1 else None
             for side in range(4):
                 values = boxes[known, side]
                 boxes[~known, side] = (
                     # the ends of the regions move in the same way
-                    values[0] if line is None else line(run[known], values, 1)(run[~known])
+                    values[0] if fit is None else fit(consecutive_rows[known], values, 1)(consecutive_rows[~known])
                 )
-        for frame, box in zip(run.tolist(), boxes, strict=True):
+        for frame, box in zip(consecutive_rows.tolist(), boxes, strict=True):
             top, bottom, left, right = box
             margin = MARGIN * min(bottom - top, right - left)
             low = np.floor(np.array([top, left]) - margin).astype(int).clip(0)
@@ -131,23 +133,24 @@ def frames_flagged(scan: ScanEvidence) -> Iterator[Finding]:
     flags = scan.flags
     if flags is None or not flags.flagged.any():
         return
-    rows, again = np.flatnonzero(flags.alarmed), scan.table.replaced
+    rows, replaced_rows = np.flatnonzero(flags.alarmed), scan.table.replaced
     message = f"The monitor flagged {flags.flagged.sum()} of {flags.bits.size} frames: {counted(flags.counts())}."
     if not rows.size:
         yield Finding("info", FLAGS, message)
         return
     message += f" Frames with an alarm: {spans(rows.tolist())}."
-    if again.size:
+    if replaced_rows.size:
         message += (
-            f" Taken again: {count(again.size, 'projection')}; the first attempts ({frames_text(again)}) are not used."
+            f" Taken again: {count(replaced_rows.size, 'projection')}; the first attempts "
+            f"({frames_text(replaced_rows)}) are not used."
         )
-        rows = np.setdiff1d(rows, again)
+        rows = np.setdiff1d(rows, replaced_rows)
         if not rows.size:
             yield Finding("info", FLAGS, f"{message} No other frame has an alarm.")
             return
         message += f" Other frames with an alarm: {spans(rows.tolist())}."
-    treated = flag_policy(flags, scan.table.are_views, scan.source.shape)
-    n, lost = int(treated.views.sum()), int(treated.left_out.sum())
+    policy = flag_policy(flags, scan.table.are_views, scan.source.shape)
+    n, lost = int(policy.views.sum()), int(policy.left_out.sum())
     if lost and n - lost < FEWEST_VIEWS:
         n_good = n - lost
         message += (
@@ -156,6 +159,6 @@ def frames_flagged(scan: ScanEvidence) -> Iterator[Finding]:
         )
         yield Finding("error", FLAGS, message)
         return
-    if treated.in_words:
-        message += f" In a reconstruction (--flags use): {treated.in_words}"
+    if policy.in_words:
+        message += f" In a reconstruction (--flags use): {policy.in_words}"
     yield Finding("warning", FLAGS, message)

@@ -33,66 +33,70 @@ class Illumination:
     Attributes:
         source: reads the frames.
         views: rows of the projections.
-        beam: cells [cell row, cell col] of the mean dark and of the mean flat; None: the projections are not divided by
-            flats.
+        dark_and_flat: cells [cell row, cell col] of the mean dark and of the mean flat; None: the projections are not
+            divided by flats.
         cells_of: function that gives the cells of a row.
     """
 
     source: ScanSource
     views: I64
-    beam: tuple[F32, F32] | None
+    dark_and_flat: tuple[F32, F32] | None
     cells_of: Callable[[int], F32]
-    _lit: dict[int, bool] = field(init=False, default_factory=dict)
+    _has_beam: dict[int, bool] = field(init=False, default_factory=dict)
 
     @cached_property
     def brightest(self) -> float:
         """Brightness, relative to the flats, of the brightest of some projections (see `brightness`); 1 if there are no
         projections.
         """
-        if self.beam is None:
+        if self.dark_and_flat is None:
             return 1.0
-        seen = [brightness(self.cells_of(row), *self.beam) for row in spread(self.views, VIEWS).tolist()]
-        return float(np.percentile(seen, BRIGHT)) if seen else 1.0
+        brightnesses = [
+            brightness(self.cells_of(row), *self.dark_and_flat) for row in spread(self.views, VIEWS).tolist()
+        ]
+        return float(np.percentile(brightnesses, BRIGHT)) if brightnesses else 1.0
 
-    def suspect(self, data: NDArray[np.generic], beam: tuple[F32, F32] | None) -> NDArray[np.bool_]:
+    def suspect(self, data: NDArray[np.generic], dark_and_flat: tuple[F32, F32] | None) -> NDArray[np.bool_]:
         """bool [view], True if a projection is dark or uniform in the given pixels, which may be a band of rows.
 
         Args:
             data: [view, row, col], as read.
-            beam: dark and flat [row, col] of the same pixels; None: the data are line integrals.
+            dark_and_flat: [row, col] of the same pixels; None: the data are line integrals.
         """
         uniform = np.array([view.min() == view.max() for view in data], np.bool_)
-        if beam is None or not len(data):
+        if dark_and_flat is None or not len(data):
             return uniform
-        some = tuple(slice(None, None, max(1, n // _ACROSS)) for n in beam[0].shape)
-        dark, intensity = beam[0][some], (beam[1] - beam[0])[some]
-        lit, least = lit_places(intensity), _SUSPECT * max(self.brightest, 0.0)
-        shares = [np.median((view[some] - dark)[lit] / intensity[lit]) if lit.any() else 0.0 for view in data]
+        sampled = tuple(slice(None, None, max(1, n // _ACROSS)) for n in dark_and_flat[0].shape)
+        dark, intensity = dark_and_flat[0][sampled], (dark_and_flat[1] - dark_and_flat[0])[sampled]
+        exposed, least = lit_places(intensity), _SUSPECT * max(self.brightest, 0.0)
+        shares = [
+            np.median((view[sampled] - dark)[exposed] / intensity[exposed]) if exposed.any() else 0.0 for view in data
+        ]
         return uniform | ~(np.array(shares) >= least)
 
-    def unlit(self, row: int) -> bool:
+    def without_beam(self, row: int) -> bool:
         """True if a whole projection is dark, or if it is uniform while the flats are not; each projection is checked
         once."""
-        if row not in self._lit:
-            self._lit[row] = not self._unlit(row)
-        return not self._lit[row]
+        if row not in self._has_beam:
+            self._has_beam[row] = not self._is_without_beam(row)
+        return not self._has_beam[row]
 
     @property
-    def known_unlit(self) -> list[int]:
+    def known_without_beam(self) -> list[int]:
         """The projections without beam, among the checked ones."""
-        return [row for row, lit in self._lit.items() if not lit]
+        return [row for row, has_beam in self._has_beam.items() if not has_beam]
 
-    def _unlit(self, row: int) -> bool:
+    def _is_without_beam(self, row: int) -> bool:
         image = read_known(self.source, [row])[0]
         if row in self.source.unreadable:
             return False  # the caller names the frame and leaves it out
         if not np.isfinite(image).any():
             return True
-        same = bool(image.min() == image.max())
-        if self.beam is None:
-            return same
-        bright = brightness(self.cells_of(row), *self.beam)
-        return bright < LEAST * self.brightest or (same and bool(np.ptp(self.beam[1]) > 0))
+        uniform = bool(image.min() == image.max())
+        if self.dark_and_flat is None:
+            return uniform
+        relative_brightness = brightness(self.cells_of(row), *self.dark_and_flat)
+        return relative_brightness < LEAST * self.brightest or (uniform and bool(np.ptp(self.dark_and_flat[1]) > 0))
 
 
 def brightness(view: F32, dark: F32, flat: F32) -> float:
@@ -100,10 +104,10 @@ def brightness(view: F32, dark: F32, flat: F32) -> float:
     the bias that noise causes.
     """
     intensity = flat - dark
-    lit = lit_places(intensity)
-    if not lit.any():
+    exposed = lit_places(intensity)
+    if not exposed.any():
         return 1.0
-    share = np.where(lit, (view - dark) / np.where(lit, intensity, 1), np.nan)
+    share = np.where(exposed, (view - dark) / np.where(exposed, intensity, 1), np.nan)
     noise = deviation_between_neighbours(share)
     known = share[np.isfinite(share)]
     if not known.size:

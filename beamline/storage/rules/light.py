@@ -57,7 +57,7 @@ def references_usable(scan: ScanEvidence) -> Iterator[Finding]:
         message = finding.message
         if finding.frames:
             name = f"{scan.table.kind(finding.frames[0]).name.lower()}s"
-            if scan.asked.accepted:
+            if scan.request.accepted:
                 message = f"--references accept: {message}"
             elif finding.severity == "error":
                 message += (
@@ -66,7 +66,7 @@ def references_usable(scan: ScanEvidence) -> Iterator[Finding]:
                 )
             else:
                 message += f" The other {name} are used instead."
-        severity = "warning" if scan.asked.accepted else finding.severity
+        severity = "warning" if scan.request.accepted else finding.severity
         yield replace(finding, severity=severity, rule="bad-references", message=message)
 
 
@@ -77,21 +77,21 @@ def views_scaled(scan: ScanEvidence) -> Iterator[Finding]:
     rows = scan.table.views
     if rows.size < VIEWS:
         return
-    ends, places = set(), (set[int](), set[int]())
+    extremes, extreme_pixels = set(), (set[int](), set[int]())
     for row in spread(rows, VIEWS).tolist():
         view = read_known(scan.source, [row])[0]
         low, high = float(view.min()), float(view.max())
-        ends.add((low, high))
-        whole = view.dtype.kind in "ui"
-        if len(ends) > 1 or not high - low >= (SPREAD if whole else 1e-30):
+        extremes.add((low, high))
+        integers = view.dtype.kind in "ui"
+        if len(extremes) > 1 or not high - low >= (SPREAD if integers else 1e-30):
             return
         if max(np.count_nonzero(view == low), np.count_nonzero(view == high)) > max(ALIKE, AT_THE_ENDS * view.size):
             return
-        places[0].add(int(view.argmin()))
-        places[1].add(int(view.argmax()))
-    if min(map(len, places)) == 1:  # a dead or a hot pixel
+        extreme_pixels[0].add(int(view.argmin()))
+        extreme_pixels[1].add(int(view.argmax()))
+    if min(map(len, extreme_pixels)) == 1:  # a dead or a hot pixel
         return
-    low, high = ends.pop()
+    low, high = extremes.pop()
     yield Finding(
         "error",
         "light",
@@ -150,13 +150,13 @@ def check_air_level(scan: ScanEvidence, level: float, air: bool, accepted: bool 
 
 def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
     """Darks are measured images, they are nowhere brighter than the projections, and air is not saturated."""
-    if scan.beam is None:
+    if scan.dark_and_flat is None:
         return
     # there are zingers in single darks
-    dark, flat = np.min(scan.cells(np.concatenate(scan.used.darks)), axis=0), scan.beam[1]
-    of_one = max(scan.used.flats, key=len)[:2] if not dark.any() else np.zeros(0, np.int64)
-    two = read_known(scan.source, of_one).astype(np.float64)  # identical if one image was written for all of them
-    if len(two) > 1 and deviation_between_frames(two) and not counts_photons(scan.source):
+    dark, mean_flat = np.min(scan.cells(np.concatenate(scan.used_references.darks)), axis=0), scan.dark_and_flat[1]
+    same_group = max(scan.used_references.flats, key=len)[:2] if not dark.any() else np.zeros(0, np.int64)
+    flats = read_known(scan.source, same_group).astype(np.float64)  # identical if one image was written for all of them
+    if len(flats) > 1 and deviation_between_frames(flats) and not counts_photons(scan.source):
         yield Finding(
             "warning",
             "light",
@@ -164,33 +164,33 @@ def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
             "darks were already subtracted from the frames. Otherwise projections and flats include the camera's "
             "offset, which makes line integrals too small: give --darks.",
         )
-    lit = lit_places(flat - dark)
-    if not lit.any():
+    exposed = lit_places(mean_flat - dark)
+    if not exposed.any():
         return
-    intensity = float(np.percentile((flat - dark)[lit], BRIGHT))
+    intensity = float(np.percentile((mean_flat - dark)[exposed], BRIGHT))
     limit = max(LIT * intensity, LIT_SIGMAS * place_noise(dark))
     views = spread(scan.table.views, VIEWS)
-    under = [(dark - view)[lit] for view in scan.cells(views)]
-    deep = [float(np.percentile(each, 100 * (1 - BELOW))) for each in under if np.isfinite(each).all()]
-    if np.count_nonzero(np.array(deep) > limit) > OF_VIEWS * VIEWS:
+    below_dark = [(dark - view)[exposed] for view in scan.cells(views)]
+    depths = [float(np.percentile(each, 100 * (1 - BELOW))) for each in below_dark if np.isfinite(each).all()]
+    if np.count_nonzero(np.array(depths) > limit) > OF_VIEWS * VIEWS:
         sentence = (
-            f"The darks are too high: in places the projections have {max(deep):.3g} counts less than the "
+            f"The darks are too high: in places the projections have {max(depths):.3g} counts less than the "
             f"darks (limit {limit:.3g}; the beam gives {intensity:.4g} counts in the flats), but the beam can "
             "only add counts. Were the darks taken with beam, with another gain or exposure, or stored "
             "as sums of frames? Give --darks with the settings of the projections."
         )
-        sentence += "" if scan.asked.accepted else " --references accept uses these as they are."
-        yield Finding("warning" if scan.asked.accepted else "error", "light", sentence)
+        sentence += "" if scan.request.accepted else " --references accept uses these as they are."
+        yield Finding("warning" if scan.request.accepted else "error", "light", sentence)
 
 
 def _counts_in_words(scan: ScanEvidence) -> str:
     """Sentences about counts and exposures of flats and projections, at the place where projections are brightest."""
     views = spread(scan.table.views, VIEWS)
-    darks, flats = (np.concatenate(groups) for groups in scan.used)
-    seen, flat, dark = (scan.mean_cells(rows) for rows in (views, flats, darks))
-    lit = lit_places(flat - dark)
-    places = lit & (seen >= np.percentile(seen[lit], BRIGHT)) if lit.any() else np.ones_like(lit)
-    counts = float(np.median(flat[places])), float(np.median(seen[places]))
+    darks, flats = (np.concatenate(groups) for groups in scan.used_references)
+    view, flat, dark = (scan.mean_cells(rows) for rows in (views, flats, darks))
+    exposed = lit_places(flat - dark)
+    brightest = exposed & (view >= np.percentile(view[exposed], BRIGHT)) if exposed.any() else np.ones_like(exposed)
+    counts = float(np.median(flat[brightest])), float(np.median(view[brightest]))
     flat_counts = counts[0]
     view_counts = counts[1]
     there = f"Counts in these places: {flat_counts:.6g} in the flats, {view_counts:.6g} in the projections."
@@ -199,9 +199,9 @@ def _counts_in_words(scan: ScanEvidence) -> str:
 
 def _exposures_in_words(scan: ScanEvidence, *rows: NDArray[np.int64]) -> str:
     """A sentence about the exposures that the file states for some flats and projections."""
-    exposed = [scan.table.exposures[some] for some in rows]
-    if all(np.isfinite(each).all() for each in exposed):
-        words = [f"{np.median(each):g} s" for each in exposed]
+    exposures = [scan.table.exposures[rows_of_kind] for rows_of_kind in rows]
+    if all(np.isfinite(each).all() for each in exposures):
+        words = [f"{np.median(each):g} s" for each in exposures]
         return f"Stated exposures: flats {words[0]}, projections {words[1]}."
     return (
         "The file does not state the exposures of both flats and projections; a different exposure of the flats "
@@ -237,32 +237,39 @@ def _noise_ratio(scan: ScanEvidence) -> float:
     of the sample adds to the variance of projections, so only their quietest tiles are used.
     """
     views = spread(scan.table.views, VIEWS)
-    taken = [np.concatenate(scan.used.darks), spread(max(scan.used.flats, key=len), VIEWS), views]
+    rows_of_kinds = [
+        np.concatenate(scan.used_references.darks),
+        spread(max(scan.used_references.flats, key=len), VIEWS),
+        views,
+    ]
     middle = scan.source.shape[0] // 2
-    rows = slice(max(middle - ROWS // 2, 0), middle + ROWS // 2)
-    darks, flats, seen = (read_known(scan.source, some, rows).astype(np.float32) for some in taken)
+    middle_rows = slice(max(middle - ROWS // 2, 0), middle + ROWS // 2)
+    darks, flats, view_images = (
+        read_known(scan.source, rows_of_kind, middle_rows).astype(np.float32) for rows_of_kind in rows_of_kinds
+    )
     if len(flats) < LEAST_FLATS:
         return 0.0
     intensity = flats.mean(axis=0) - darks.mean(axis=0)
     intensity[~lit_places(intensity)] = np.nan
-    of_flats, of_views = (
-        np.median([_gain(image - darks.mean(axis=0), intensity) for image in kind]) for kind in (flats, seen)
+    flat_ratio, view_ratio = (
+        np.median([_variance_per_count(image - darks.mean(axis=0), intensity) for image in kind])
+        for kind in (flats, view_images)
     )
-    ratio = float(of_flats / of_views) * len(flats) / (len(flats) - 1) if of_views > 0 else 0.0
+    ratio = float(flat_ratio / view_ratio) * len(flats) / (len(flats) - 1) if view_ratio > 0 else 0.0
     return ratio if math.isfinite(ratio) else 0.0
 
 
-def _gain(net: F32, intensity: F32) -> float:
+def _variance_per_count(net: F32, intensity: F32) -> float:
     """Variance of the counts divided by the counts, in the quietest tiles of an image; NaN if there are no such
     tiles.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         change = np.diff(np.diff(net / intensity, axis=0), axis=1)
-        each = np.where(net > 0, intensity**2 / net, np.nan)[1:, 1:] * change**2 / 4
-    rows, cols = (n // TILE for n in each.shape)
+        ratios = np.where(net > 0, intensity**2 / net, np.nan)[1:, 1:] * change**2 / 4
+    rows, cols = (n // TILE for n in ratios.shape)
     if not rows or not cols:
         return math.nan
-    tiles = each[: rows * TILE, : cols * TILE].reshape(rows, TILE, cols, TILE).mean(axis=(1, 3))
+    tiles = ratios[: rows * TILE, : cols * TILE].reshape(rows, TILE, cols, TILE).mean(axis=(1, 3))
     known = tiles[np.isfinite(tiles)]
     return float(np.percentile(known, QUIET)) if known.size else math.nan
 
@@ -277,18 +284,18 @@ def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
     darks, flats = (scan.table.exposures[rows] for rows in (scan.table.darks, scan.table.flats))
     if scan.views_differ:
         views = scan.table.exposures[scan.table.views]
-        known = bool((flats > 0).all())
-        taken = scan.exposures[scan.table.flats]
-        assumed_exposure = np.nan_to_num(taken, nan=usual).max(initial=0.0)
+        flats_stated = bool((flats > 0).all())
+        flat_exposures = scan.exposures[scan.table.flats]
+        assumed_exposure = np.nan_to_num(flat_exposures, nan=usual).max(initial=0.0)
         doubt = f"scaled to {usual:g} s" + (
             "."
-            if known
+            if flats_stated
             else f". The exposure of the flats is not stated. {assumed_exposure:g} s is assumed, because no "
             "projection is then brighter than the flats. If the sample fills the field of view, this exposure "
             "may be wrong. All line integrals are then wrong by the same amount."
         )
         yield Finding(
-            "info" if known else "warning",
+            "info" if flats_stated else "warning",
             "exposures",
             f"The projections were exposed for {views.min():g} to {views.max():g} s; the intensity of each "
             f"projection is {doubt}",
@@ -324,9 +331,9 @@ def one_intensity(scan: ScanEvidence) -> Iterator[Finding]:
     ):
         return
     levels = [_log_intensities(scan, part) for part in ends]
-    n, change, most = lights_in_turn(levels[0]), np.ptp(levels[0]), ReferenceLimits().uneven
-    beside = np.median(np.abs(np.diff(scan.table.angles[ends[0]]))) <= _BESIDE
-    if not (beside and n and n == lights_in_turn(levels[1]) and change >= most):
+    n, change, limit = lights_in_turn(levels[0]), np.ptp(levels[0]), ReferenceLimits().uneven
+    small_steps = np.median(np.abs(np.diff(scan.table.angles[ends[0]]))) <= _BESIDE
+    if not (small_steps and n and n == lights_in_turn(levels[1]) and change >= limit):
         return
     difference = np.expm1(change)
     first_frame = views[0]
@@ -335,11 +342,11 @@ def one_intensity(scan: ScanEvidence) -> Iterator[Finding]:
         "light",
         f"The projections alternate between {n} intensities from frame to frame (from frame {first_frame} on; "
         f"{difference:.0%} apart), because thresholds, exposures or energies alternate. A volume can use only one of "
-        f"these intensities. {_way_of_steps(scan, n, most)}",
+        f"these intensities. {_advice_on_steps(scan, n, limit)}",
     )
 
 
-def _way_of_steps(scan: ScanEvidence, n: int, most: float) -> str:
+def _advice_on_steps(scan: ScanEvidence, n: int, most: float) -> str:
     """The step through the projections that selects one of `n` intensities together with its flats."""
     shares = np.array([_share_of_flats(scan, slice(first, None, n), most) for first in range(n)])
     steps = [f"--frames {first}::{n}" for first in range(n) if 0 < shares[first] >= _AS_GOOD * shares.max()]

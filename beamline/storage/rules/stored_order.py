@@ -28,7 +28,7 @@ def axis_vertical(scan: ScanEvidence) -> Iterator[Finding]:
     views = scan.table.views_with_angles
     if scan.table.shifts is not None or views.size < _LEAST or min(scan.source.shape) < _LEAST:
         return
-    depths = _depths(scan, spread(views, _TURNED))
+    depths = _coarse_line_integrals(scan, spread(views, _TURNED))
     if not depths.size:
         return
     ratio = change_of_rows(depths)
@@ -38,11 +38,11 @@ def axis_vertical(scan: ScanEvidence) -> Iterator[Finding]:
             "axis",
             "The rotation axis seems to be horizontal; expected along the columns. Between projections, the total "
             f"absorption of a row changes {ratio:.3g} times as much as the total absorption of a column. "
-            f"{_exchanged(scan)}If the axis is horizontal, give --horizontal-axis.",
+            f"{_advice_on_exchanged_axes(scan)}If the axis is horizontal, give --horizontal-axis.",
         )
 
 
-def _exchanged(scan: ScanEvidence) -> str:
+def _advice_on_exchanged_axes(scan: ScanEvidence) -> str:
     """A sentence that says how to exchange rows and columns of stacks in HDF5; "" for other formats.
 
     MATLAB writes dimensions in reverse order. Rotating such images by 90 degrees would give their mirror images.
@@ -50,8 +50,8 @@ def _exchanged(scan: ScanEvidence) -> str:
     data, others = scan.source.stack_options
     dimensions = str(scan.source.attributes.get("dimensions", "frame,row,col"))
     order = ",".join({"row": "col", "col": "row"}.get(axis, axis) for axis in dimensions.split(","))
-    say = f"If rows and columns are exchanged, as MATLAB writes them, give --data-path {data}:{order}{others}. "
-    return say if data else ""
+    advice = f"If rows and columns are exchanged, as MATLAB writes them, give --data-path {data}:{order}{others}. "
+    return advice if data else ""
 
 
 def change_of_rows(depths: NDArray[np.float64]) -> float:
@@ -64,11 +64,11 @@ def change_of_rows(depths: NDArray[np.float64]) -> float:
     Therefore a parabola over the rows and the mean profile of the rows are fitted to the ends and subtracted.
     """
     change = depths - depths.mean(axis=0)
-    ends = max(1, depths.shape[2] // 16)
-    beside = np.median(np.concatenate([change[..., :ends], change[..., -ends:]], axis=2), axis=2)
+    n_edge = max(1, depths.shape[2] // 16)
+    edge_change = np.median(np.concatenate([change[..., :n_edge], change[..., -n_edge:]], axis=2), axis=2)
     parabola = np.polynomial.legendre.legvander(np.linspace(-1, 1, depths.shape[1]), 2)
     profiles = np.column_stack([parabola, depths.mean(axis=(0, 2))])
-    change = change - (beside @ np.linalg.pinv(profiles, rcond=1e-6).T @ profiles.T)[..., None]
+    change = change - (edge_change @ np.linalg.pinv(profiles, rcond=1e-6).T @ profiles.T)[..., None]
     of_rows, of_cols = (float(change.sum(axis=axis).var(axis=0).sum()) for axis in (2, 1))
     rounding = 1e-20 * float((np.abs(depths).sum(axis=2) ** 2).sum())
     return of_rows / max(of_cols, rounding) if of_rows > rounding else 0.0
@@ -84,16 +84,22 @@ def views_first(scan: ScanEvidence) -> Iterator[Finding]:
     angles = scan.table.angles[views]
     if scan.table.shifts is not None or not views.size == scan.source.shape[0] >= _LEAST_SQUARE:
         return
-    some = np.arange(views.size)[:: -(-views.size // SHAPES)]
-    depths = _depths(scan, views[some]) if np.isfinite(angles).all() and scan.source.shape[1] >= _LEAST else np.zeros(0)
-    if len(depths) != some.size:
+    chosen = np.arange(views.size)[:: -(-views.size // SHAPES)]
+    depths = (
+        _coarse_line_integrals(scan, views[chosen])
+        if np.isfinite(angles).all() and scan.source.shape[1] >= _LEAST
+        else np.zeros(0)
+    )
+    if len(depths) != chosen.size:
         return
-    ends = max(1, depths.shape[2] // 16)
-    depths = depths - np.median(np.concatenate([depths[..., :ends], depths[..., -ends:]], axis=2), axis=2)[..., None]
-    mass, first = depths.sum(axis=2), depths @ (np.arange(depths.shape[2]) - (depths.shape[2] - 1) / 2)
+    n_edge = max(1, depths.shape[2] // 16)
+    depths = (
+        depths - np.median(np.concatenate([depths[..., :n_edge], depths[..., -n_edge:]], axis=2), axis=2)[..., None]
+    )
+    mass, first_moment = depths.sum(axis=2), depths @ (np.arange(depths.shape[2]) - (depths.shape[2] - 1) / 2)
     rows = len(mass[0])
-    along_rows = _explained(first.T, np.array([part.mean() for part in np.array_split(angles, rows)]))
-    along_frames = _explained(first, angles[some])
+    along_rows = _explained(first_moment.T, np.array([part.mean() for part in np.array_split(angles, rows)]))
+    along_frames = _explained(first_moment, angles[chosen])
     if mass.var(axis=0).sum() / len(mass[0]) > _OTHER_MASS * mass.var(axis=1).sum() / len(mass) and (
         along_rows > _ON_A_SINE and 1 - along_frames > _OFF_A_SINE * (1 - along_rows)
     ):
@@ -131,27 +137,27 @@ def sinogram_assumed(scan: ScanEvidence) -> Iterator[Finding]:
 
 def _explained(values: NDArray[np.float64], angles: NDArray[np.float64]) -> float:
     """The share of the change of values [view, ...] that a sine of the angles [view] explains."""
-    parts = np.column_stack([np.ones_like(angles), np.cos(angles), np.sin(angles)])
-    rest = values - parts @ np.linalg.lstsq(parts, values, rcond=None)[0]
+    basis = np.column_stack([np.ones_like(angles), np.cos(angles), np.sin(angles)])
+    residual = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
     change = float(values.var(axis=0).sum())
-    return 1 - float((rest**2).mean(axis=0).sum()) / change if change > 0 else 0.0
+    return 1 - float((residual**2).mean(axis=0).sum()) / change if change > 0 else 0.0
 
 
-def _depths(scan: ScanEvidence, views: NDArray[np.int64]) -> NDArray[np.float64]:
+def _coarse_line_integrals(scan: ScanEvidence, views: NDArray[np.int64]) -> NDArray[np.float64]:
     """Coarse line integrals [view, row, col] of some projections, minus the part that all projections share."""
     block = max(1, min(max(scan.source.shape) // 128, min(scan.source.shape) // _LEAST))
     rows, cols = (n // block for n in scan.source.shape)
     darks = scan.table.darks[:1]
     dark = read_known(scan.source, darks)[0].astype(np.float64) if darks.size and scan.in_counts else 0.0
-    bits = []
+    coarse_views = []
     for view in views.tolist():
         image = read_known(scan.source, [view])[0].astype(np.float64)
         if view in scan.source.unreadable or not np.isfinite(image).all():
             continue
         image = image if scan.source.quantity == "line_integrals" else with_borders_filled(image) - dark
         coarse = image[: rows * block, : cols * block].reshape(rows, block, cols, block).mean(axis=(1, 3))
-        bits.append(coarse)
-    depths = np.array(bits).reshape(-1, rows, cols)
+        coarse_views.append(coarse)
+    depths = np.array(coarse_views).reshape(-1, rows, cols)
     if scan.source.quantity == "line_integrals" or not len(depths):
         return depths
     if not depths.max() > 0:  # the pixels are neither counts nor transmission

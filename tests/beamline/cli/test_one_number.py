@@ -33,7 +33,7 @@ def test_the_residual_of_views_held_out_of_recon_sweep_and_tradeoff(folder: Path
     source = ArraySource(SCAN.line_integrals().astype(np.float32), [0] * len(SCAN.angles), SCAN.angles)
     source.quantity = "line_integrals"
     prepared = prepare_projections(select(source, Selection(views="every:3", axis_col=20.7)), lambda _: None)
-    prepared = replace(prepared, sources=replace(prepared.sources, of_views=None))
+    prepared = replace(prepared, sources=replace(prepared.sources, view_weights=None))
     grid = Grid.matching(prepared.geometry)
     volume = Volume(direct(prepared.seen.data, prepared.geometry, grid, "hann"), grid)
     by_recon = judge(volume, prepared.views).figures["residual_held_out"]

@@ -10,9 +10,9 @@ import pytest
 from beamline.core.errors import ConfigError
 from beamline.projections.scan_statistics import (
     PERCENT,
-    LightAsked,
+    DoseRequest,
     histograms,
-    light_of,
+    photon_dose_of,
     statistics_of,
     table,
 )
@@ -31,13 +31,13 @@ def test_counts_are_described_exactly_by_kind(tmp_path: Path) -> None:
     assert [each.kind.name for each in found] == ["DARK", "FLAT", "PROJECTION"]
     for each in found:
         pixels = np.stack([frame.counts for frame in frames if frame.kind == each.kind]).astype(float)
-        assert (each.frames, each.of) == (len(pixels), len(pixels))
+        assert (each.frames, each.n_all) == (len(pixels), len(pixels))
         assert (each.minimum, each.maximum) == (pixels.min(), pixels.max())
         np.testing.assert_allclose((each.mean, each.deviation), (pixels.mean(), pixels.std()), rtol=1e-9)
         expected = np.percentile(pixels, PERCENT, method="inverted_cdf")
         np.testing.assert_array_equal(each.percentiles, expected)
         assert each.saturated == (pixels == 65535).mean()
-        assert each.pixels.sum() == pixels.size
+        assert each.bin_counts.sum() == pixels.size
     assert said[-1] == (2 * len(frames), 2 * len(frames))
     assert histograms(found).startswith(b"\x89PNG")
     assert [row[0] for row in table(found)] == ["kind", "dark", "flat", "projection"]
@@ -67,7 +67,7 @@ def test_photons_and_dose_follow_from_the_flats(tmp_path: Path) -> None:
     with open_scan(path) as source:
         found = statistics_of(source, lambda n, of: None)
         photons = (found[1].mean - found[0].mean) * 0.25
-        light, dose = light_of(source, found, LightAsked(0.25, "water")).in_words()
+        light, dose = photon_dose_of(source, found, DoseRequest(0.25, "water")).in_words()
     views = SCAN.angles.size
     each = f"{photons:.4g} photons per pixel and projection in the open beam"
     assert light == f"{each}, {photons * views:.4g} in {views} projections"
@@ -88,7 +88,7 @@ def test_what_a_dose_lacks_is_said_before_any_frame_is_read(
 ) -> None:
     frames = [replace(f, index=n) for n, f in enumerate(f for f in frames_of(SCAN) if f.kind in kinds)]
     path = write_flagged(tmp_path / "scan.h5", frames, {}, pixel_size_mm=0.002, energy_kev=energy_kev)
-    asked = LightAsked(0.25, material)
+    asked = DoseRequest(0.25, material)
     with open_scan(path) as source, pytest.MonkeyPatch.context() as patch:
         patch.setattr(source, "read", lambda rows: pytest.fail(f"rows {rows} were read"))
         with pytest.raises(ConfigError, match=said):

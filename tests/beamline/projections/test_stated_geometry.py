@@ -109,7 +109,7 @@ def volume(path: Path) -> Volume:
     """By the direct method, in mm."""
     prepared, _ = prepare(path, Selection(steps=(Air("none"),)))
     assert prepared.origin.length_unit == "mm"
-    return prepared.stretched(recon.reconstruct(prepared.seen.data, prepared.geometry, "fbp").volume)
+    return prepared.with_true_heights(recon.reconstruct(prepared.seen.data, prepared.geometry, "fbp").volume)
 
 
 def psnr(path: Path) -> float:

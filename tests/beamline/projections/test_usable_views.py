@@ -39,8 +39,8 @@ def test_what_is_left_out_and_what_weighs_half_is_told_in_a_line(tmp_path: Path)
     np.testing.assert_array_equal(found.ids, used)
     np.testing.assert_allclose(found.geometry.angles, SCAN.angles[np.array(used) - FIRST], atol=1e-9)
     np.testing.assert_allclose(found.seen.data, SCAN.line_integrals()[np.array(used) - FIRST], atol=1e-4)
-    assert found.sources.of_views is not None
-    weights = {row: w for row, w in zip(used, found.sources.of_views.tolist(), strict=True) if w != 1}
+    assert found.sources.view_weights is not None
+    weights = {row: w for row, w in zip(used, found.sources.view_weights.tolist(), strict=True) if w != 1}
     assert weights == {FIRST + 3: WARNED_WEIGHT, FIRST + 20: WARNED_WEIGHT}
     assert found.views.weights[...].shape == (24, 2, 40)
     rays = hold_out(found, 8, advice="").views.weights[...]
@@ -58,14 +58,14 @@ def test_a_selection_and_the_views_held_out_are_of_the_good_views(tmp_path: Path
     assert not set(used + FIRST) & set(ALARMS)
     everything, _ = prepare(tmp_path / "scan.h5", SELECTION)
     kept = hold_out(everything, 4, advice="")
-    assert kept.sources.of_views is not None
+    assert kept.sources.view_weights is not None
     expected = [LEVELS.get(row) is Level.WARN for row in kept.ids.tolist()]
-    np.testing.assert_array_equal(kept.sources.of_views == WARNED_WEIGHT, expected)
+    np.testing.assert_array_equal(kept.sources.view_weights == WARNED_WEIGHT, expected)
 
 
 def test_flags_may_be_ignored(tmp_path: Path) -> None:
     found, told = prepare(scan(tmp_path), SELECTION.with_steps(Preparation("ignore")))
-    assert found.geometry.n_views == 30 and found.sources.of_views is None and found.views.weights is None
+    assert found.geometry.n_views == 30 and found.sources.view_weights is None and found.views.weights is None
     assert told[0] == "--flags ignore: 6 projections with an alarm and 2 with a warning are used as they are."
 
 

@@ -27,7 +27,7 @@ def test_angles_of_another_scale(seed: int, stretch: float) -> None:
         assert shown.stretch_sigma < 0.01
     if stretch == 1:
         assert shown.axis_col == pytest.approx(AXIS, abs=0.1)
-        assert np.ptp(shown.down) < 8 * shown.down_sigma
+        assert np.ptp(shown.row_shift) < 8 * shown.row_shift_sigma
 
 
 def test_heights_of_views() -> None:
@@ -37,13 +37,13 @@ def test_heights_of_views() -> None:
     views = np.stack([view[8 - sink : 8 - sink + 2 * SHAPE[0] : 2] for view, sink in zip(high, sinks, strict=True)])
     shown = moments_of(noisy(views), ANGLES, AXIS)
     expected = sinks / 2 - (sinks / 2).mean()
-    np.testing.assert_allclose(shown.down, expected, atol=0.25)
+    np.testing.assert_allclose(shown.row_shift, expected, atol=0.25)
 
 
 def test_what_few_rows_and_views_do_not_tell() -> None:
     views = noisy(Balls(ANGLES, SHAPE, AXIS).views())
     shown = moments_of(views[:3, :4], ANGLES[:3], AXIS)
-    assert np.isnan([shown.axis_col, shown.stretch, *shown.down]).all()
+    assert np.isnan([shown.axis_col, shown.stretch, *shown.row_shift]).all()
     assert np.isnan(moments_of(np.zeros_like(views), ANGLES, AXIS).stretch)
 
 

@@ -45,7 +45,7 @@ def test_views_of_a_turned_detector_are_those_of_a_straight_one() -> None:
     views = _spots(99.5 + c * u + s * v, 74.5 + c * v - s * u)[None]
     there = _spots(99.5 + u, 74.5 + v)
     Resampling(SHAPE, turn).apply(views, 0)
-    seen = ~Resampling(SHAPE, turn).unseen(SHAPE, 0)
+    seen = ~Resampling(SHAPE, turn).outside_detector(SHAPE, 0)
     np.testing.assert_allclose(views[0][seen], there[seen], atol=0.003 * there.max())
 
 
@@ -59,7 +59,8 @@ def test_rows_of_a_slab_are_those_of_the_whole(binning: int) -> None:
     start = (first - reach) * binning
     where = np.s_[reach : reach + last - first]
     np.testing.assert_array_equal(
-        resampling.unseen(slab.shape[1:], start), resampling.unseen((rows, cols), 0)[first - reach : last + reach]
+        resampling.outside_detector(slab.shape[1:], start),
+        resampling.outside_detector((rows, cols), 0)[first - reach : last + reach],
     )
     mask = whole[0] > 0.9
     near = resampling.nearest(mask[first - reach : last + reach], start)[where]

@@ -110,7 +110,7 @@ def test_spots_that_are_too_large_are_counted(size: int, left: int) -> None:
     views[5, 8 : 8 + size, 20 : 20 + size] += 1.5
     ids = np.arange(VIEWS)
     _, after = spots.feed(Transmission(views, ids, np.zeros(VIEWS, int), np.ones(VIEWS, np.float32)))
-    assert after.left == left and spots.left == 0
+    assert after.n_unfilled == left and spots.n_unfilled == 0
 
 
 def test_a_bright_pixel_that_may_be_a_rim_of_few_views_is_no_large_spot() -> None:
@@ -121,7 +121,7 @@ def test_a_bright_pixel_that_may_be_a_rim_of_few_views_is_no_large_spot() -> Non
     ids = np.arange(VIEWS)
     found, after = spots.feed(Transmission(views, ids, np.zeros(VIEWS, int), np.ones(VIEWS, np.float32)))
     assert np.flatnonzero(found.repaired).tolist() == [8]
-    assert after.left == 0
+    assert after.n_unfilled == 0
 
 
 def test_neighbours_of_interlaced_views_are_those_by_angle() -> None:

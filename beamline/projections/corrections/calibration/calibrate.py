@@ -52,7 +52,7 @@ class Calibrate:
     """
 
     name: ClassVar[str] = "calibrate"
-    asked_by: ClassVar[str] = "--calibrate"
+    requested_by: ClassVar[str] = "--calibrate"
     follows: ClassVar[tuple[str, ...]] = ("jumps", "poses", "background")
     terms: tuple[str, ...] = option(
         "--calibrate",
@@ -71,7 +71,7 @@ class Calibrate:
         return frozenset(self.terms).intersection(GEOMETRY)
 
     @property
-    def may_lean(self) -> bool:
+    def may_roll_or_tilt(self) -> bool:
         """True if the calibration may find a roll or tilt of the projections: a detector row then shows several
         slices.
         """
@@ -97,13 +97,13 @@ class Calibrate:
         from recon.features.calibration.learn import LEAST_VIEWS
 
         for term in self.terms:
-            least, wide, views = LEAST_VIEWS, 1, usable
+            least_views, least_cols, n_views = LEAST_VIEWS, 1, usable
             if term == GAINS:
-                least, wide, views = gains.LEAST_VIEWS, gains.LEAST_COLS, used
-            if views < least or cols < wide:
+                least_views, least_cols, n_views = gains.LEAST_VIEWS, gains.LEAST_COLS, used
+            if n_views < least_views or cols < least_cols:
                 raise DataError(
-                    f"Omit --calibrate {term}: the scan has {views} projections of {cols} columns, and "
-                    f"{term} needs {least} projections of {wide} columns. Nothing was read."
+                    f"Omit --calibrate {term}: the scan has {n_views} projections of {cols} columns, and "
+                    f"{term} needs {least_views} projections of {least_cols} columns. Nothing was read."
                 )
 
     def learn(
@@ -193,19 +193,19 @@ def calibrated(
     source, selection, band = scan.source, scan.selection, _band(scan)
     views = line_integrals_of(band, frames)
     ids = views.view_ids
-    before = geometry_before(band, ids)
+    geometry = geometry_before(band, ids)
     measured = ~areas(views.masked)
     try:
         learnt = learn_geometry(
-            views.data, before, terms, progress, None if measured.all() else measured.astype(np.float32)
+            views.data, geometry, terms, progress, None if measured.all() else measured.astype(np.float32)
         )  # fmt: skip
     except ValueError as error:
         raise DataError(f"{source.path}: the geometry could not be calibrated: {error}. Omit --calibrate.") from error
-    looked, middle = band.selection.detector_rows, (source.shape[0] - 1) / 2
-    whole = replace(selection, binning=1, rows=None).geometry(0.0, np.zeros(1))
-    off = 0.0 if before.is_cone else middle - (looked.start + looked.stop - 1) / 2
+    band_rows, middle = band.selection.detector_rows, (source.shape[0] - 1) / 2
+    unbinned = replace(selection, binning=1, rows=None).geometry(0.0, np.zeros(1))
+    off_middle = 0.0 if geometry.is_cone else middle - (band_rows.start + band_rows.stop - 1) / 2
     change = learnt.change.scaled(band.selection.binning)
-    return Calibrated(ids, change, whole.pixel_pitch, off, selection.pivot, band.selection.binning, learnt)
+    return Calibrated(ids, change, unbinned.pixel_pitch, off_middle, selection.pivot, band.selection.binning, learnt)
 
 
 def _search_memory(part: ScanPart, terms: frozenset[str]) -> int:

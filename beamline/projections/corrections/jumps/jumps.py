@@ -90,7 +90,7 @@ def find_jumps(
     frames: I64,
     jumps: I64,
     axis_col: float,
-    progress: Callable[[int, int], None] = lambda n, most: None,
+    progress: Callable[[int, int], None] = lambda n, n_most: None,
 ) -> SampleJumps:
     """The longest run of projections in which the sample stayed in one place.
 
@@ -114,43 +114,49 @@ def find_jumps(
             f"the sample jumped at {where}. In a cone beam jumps cannot be checked, so all projections "
             "are used as if the sample had not moved.",
         )
-    runs, most = [frames], jumps.size * (jumps.size + 1) // 2
-    part = np.searchsorted(jumps, frames, side="right")
-    steady = frames[np.bincount(part)[part] >= LEAST]  # projections between two alarms are left out of the comparison
-    real, number, n = list[int](), 0, 0
-    while number < len(runs):
-        run, clearest, best = np.intersect1d(runs[number], steady), 1.0, 0
+    runs, n_most = [frames], jumps.size * (jumps.size + 1) // 2
+    part_of_frame = np.searchsorted(jumps, frames, side="right")
+    # projections between two alarms are left out of the comparison
+    compared = frames[np.bincount(part_of_frame)[part_of_frame] >= LEAST]
+    confirmed, run_number, n = list[int](), 0, 0
+    while run_number < len(runs):
+        run, largest_clearness, best_jump = np.intersect1d(runs[run_number], compared), 1.0, 0
         for row in jumps.tolist():
             if min((run < row).sum(), (run >= row).sum()) >= LEAST:
                 n += 1
-                progress(n, most)
-                if (clear := _clearness(scan, axis_col, run, row)) > clearest:
-                    clearest, best = clear, row
-        if best:
-            real.append(best)
-            runs[number : number + 1] = [runs[number][runs[number] < best], runs[number][runs[number] >= best]]
+                progress(n, n_most)
+                if (clearness := _clearness(scan, axis_col, run, row)) > largest_clearness:
+                    largest_clearness, best_jump = clearness, row
+        if best_jump:
+            confirmed.append(best_jump)
+            runs[run_number : run_number + 1] = [
+                runs[run_number][runs[run_number] < best_jump],
+                runs[run_number][runs[run_number] >= best_jump],
+            ]
         else:
-            number += 1
+            run_number += 1
     usable = max(runs, key=len)
-    if real:  # it is not known either to which side these projections belong
-        inner = np.intersect1d(usable, steady)
+    if confirmed:  # it is not known either to which side these projections belong
+        inner = np.intersect1d(usable, compared)
         usable = usable[(usable >= inner[0]) & (usable <= inner[-1])]
-    return SampleJumps(usable, _sentence_on_jumps(np.array(sorted(real), np.int64), jumps, frames.size - usable.size))
+    return SampleJumps(
+        usable, _sentence_on_jumps(np.array(sorted(confirmed), np.int64), jumps, frames.size - usable.size)
+    )
 
 
-def _sentence_on_jumps(real: I64, jumps: I64, lost: int) -> str:
+def _sentence_on_jumps(confirmed: I64, jumps: I64, lost: int) -> str:
     """A sentence that says what was done at real jumps, and at which alarms the projections show no jump."""
     text = list[str]()
     if lost:
         verb = "is" if lost == 1 else "are"
         text.append(
-            f"The sample jumped at {frames_text(real)}. {count(lost, 'projection')} {verb} left out, because the "
+            f"The sample jumped at {frames_text(confirmed)}. {count(lost, 'projection')} {verb} left out, because the "
             f"sample was at another position there. {_REPAIRED}"
         )
-    if (none := np.setdiff1d(jumps, real)).size:
+    if (unconfirmed := np.setdiff1d(jumps, confirmed)).size:
         text.append(
-            f"The monitor reported motion at {frames_text(none)}, but the projections show no jump of the sample, so "
-            "all these projections are used without a correction."
+            f"The monitor reported motion at {frames_text(unconfirmed)}, but the projections show no jump of the "
+            "sample, so all these projections are used without a correction."
         )
     return " ".join(text)
 
@@ -165,9 +171,9 @@ def _clearness(scan: SelectedScan, axis_col: float, frames: I64, row: int) -> fl
 
     step = max(1, math.ceil(frames.size / _VIEWS))
     sides = frames[frames < row], frames[frames >= row]
-    looked = np.concatenate([side[:: 1 if side.size <= _SHORT else step] for side in sides])
+    sampled = np.concatenate([side[:: 1 if side.size <= _SHORT else step] for side in sides])
     band = _band(scan)
-    views = line_integrals_of(band, looked)
+    views = line_integrals_of(band, sampled)
     geometry = band.selection.geometry(axis_col, scan.table.angles[views.view_ids])
     part = (views.view_ids >= row).astype(np.int64)
     fit = judge(views.data, geometry, part, ~areas(views.masked), [Displacement()] * 2)

@@ -85,11 +85,11 @@ def test_a_view_with_a_region_is_used_beside_it(tmp_path: Path) -> None:
     alarm, half = (flag(row, (0, 4, 10, 12), level) for row, level in ((8, Level.ALARM), (9, Level.WARN)))
     path = write_flagged(tmp_path / "scan.h5", frames_of(data), {}, flags=[alarm, half])
     prepared, told = prepare(path, Selection(axis_col=data.axis_col, steps=(Air("none"),)))
-    assert prepared.geometry.n_views == 30 and prepared.origin.left_out == 0 and prepared.sources.of_views is None
+    assert prepared.geometry.n_views == 30 and prepared.origin.left_out == 0 and prepared.sources.view_weights is None
     rays = prepared.views.weights[...]
     assert rays.shape == (30, 4, 40)
     assert (rays[4, :, 10:12] == 0).all() and (rays[5, :, 10:12] == WARNED_SHARE).all()
     assert (rays != 1).any(axis=(1, 2)).sum() == 2
     assert "2 are flagged in a region" in told[0]
     kept = hold_out(prepared, 10, advice="")
-    assert kept.sources.shares is not None and len(kept.sources.shares) == kept.geometry.n_views
+    assert kept.sources.region_weights is not None and len(kept.sources.region_weights) == kept.geometry.n_views

@@ -76,7 +76,7 @@ def test_the_lens_keeps_its_centre() -> None:
         source: Any = cropped(_Flagged(), cols)
         found = TiltAndLens(distortion=lens).of(select(source, Selection()))
         assert found is not None
-        places.append(found.places(source.shape, 0)[1] + cols[0])
+        places.append(found.positions(source.shape, 0)[1] + cols[0])
     np.testing.assert_allclose(places[1], places[0][:, 30:90])
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from beamline.storage.rules import Finding
 from beamline.storage.rules.angles import angles_spread
-from beamline.storage.rules.angles_shown import angles_in_order, angles_seen, coarse_views
+from beamline.storage.rules.angles_shown import angles_in_order, coarse_views, rotation_matches_images
 from beamline.storage.rules.evidence import ScanEvidence
 from tests.beamline.array_source import ArraySource, scan_of
 
@@ -41,7 +41,7 @@ def scan(balls: Balls, true: NDArray[np.float64], stated: NDArray[np.float64], a
 
 def told(source: ArraySource) -> list[Finding]:
     seen = coarse_views(ScanEvidence(source))
-    return [] if seen is None else list(angles_seen(seen))
+    return [] if seen is None else list(rotation_matches_images(seen))
 
 
 def turn(degrees: float, views: int, endpoint: bool = False) -> NDArray[np.float64]:

@@ -39,7 +39,11 @@ def test_rules_on_light_and_angles_read_each_frame_once_for_all_of_them() -> Non
     read = rows_read(source)
     assert read == sorted(set(read)) and set(range(8)) <= set(read)
     before = len(source.was_read)
-    assert all(evidence.used) and 0 < evidence.light.brightest <= 1.1 and evidence.light.unlit(8 + 20) is not None
+    assert (
+        all(evidence.used_references)
+        and 0 < evidence.illumination.brightest <= 1.1
+        and evidence.illumination.without_beam(8 + 20) is not None
+    )
     assert all(rows == [28] for rows, _ in source.was_read[before:])
 
 
@@ -48,31 +52,38 @@ def test_a_running_scan_adds_its_new_frames_to_what_was_seen() -> None:
     whole = source.table
     source.table = whole.take(np.arange(6))  # 4 darks and 2 flats
     first = ScanEvidence(source)
-    assert first.renewed() is first and [group.size for group in (*first.used.darks, *first.used.flats)] == [4, 2]
+    assert first.renewed() is first and [
+        group.size for group in (*first.used_references.darks, *first.used_references.flats)
+    ] == [4, 2]
     source.table = whole
-    assert first.taken.flats[0].size == 2  # what was taken stays
+    assert first.all_references.flats[0].size == 2  # what was taken stays
     more = first.renewed()
-    assert more.used.flats[0].tolist() == [4, 5, 6, 7]
+    assert more.used_references.flats[0].tolist() == [4, 5, 6, 7]
     assert not {0, 1, 2, 3, 4, 5} & set(chain.from_iterable(rows for rows, _ in source.was_read[6:]))
 
 
 def test_faulty_references_are_left_out_or_accepted_as_they_are() -> None:
     source = scan(lit_dark=3000)
     checked, accepted = ScanEvidence(source), ScanEvidence(source, EvidenceRequest(accepted=True))
-    assert checked.used.darks[0].tolist() == [0, 1, 2] and accepted.used.darks[0].tolist() == [0, 1, 2, 3]
+    assert checked.used_references.darks[0].tolist() == [0, 1, 2] and accepted.used_references.darks[0].tolist() == [
+        0,
+        1,
+        2,
+        3,
+    ]
     (warned,), (taken,) = references_usable(checked), references_usable(accepted)
     assert warned.message.endswith("The other darks are used instead.")
     assert taken.message.startswith("--references accept: ") and {warned.severity, taken.severity} == {"warning"}
-    assert checked.beam is not None and accepted.beam is not None
-    np.testing.assert_allclose((accepted.beam[0] - checked.beam[0]).mean(), 750, rtol=0.02)
+    assert checked.dark_and_flat is not None and accepted.dark_and_flat is not None
+    np.testing.assert_allclose((accepted.dark_and_flat[0] - checked.dark_and_flat[0]).mean(), 750, rtol=0.02)
     assert not list(darks_beside_views(checked))
 
 
 def test_without_references_or_counts_no_beam_is_known() -> None:
     source = scan()
     source.table = FrameTable.of(np.zeros(48), np.linspace(0, 3, 48))
-    assert ScanEvidence(source).beam is None and ScanEvidence(source).light.brightest == 1
+    assert ScanEvidence(source).dark_and_flat is None and ScanEvidence(source).illumination.brightest == 1
     source = scan()
     source.quantity = "line_integrals"
     evidence = ScanEvidence(source)
-    assert evidence.findings == () and evidence.beam is None and not source.was_read
+    assert evidence.findings == () and evidence.dark_and_flat is None and not source.was_read

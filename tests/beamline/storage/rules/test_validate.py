@@ -18,7 +18,7 @@ from beamline.features.files.validate import describe, source_findings, validate
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.stacks import FrameStack, StacksSource
 from beamline.storage.rules import Finding
-from beamline.storage.rules.angles import angles_spread, half_turn_unseen
+from beamline.storage.rules.angles import angles_spread, degrees_without_projection
 from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
@@ -282,11 +282,11 @@ def test_uneven_angles_over_half_a_turn_are_no_limited_angle(views: int) -> None
         "from -90": np.linspace(-90, 90, views, endpoint=False),
     }
     for name, degrees in whole.items():
-        assert half_turn_unseen(np.radians(degrees)) == 0, name
+        assert degrees_without_projection(np.radians(degrees)) == 0, name
     for lost in (40, 60, 90):
         kept = np.linspace(0, 180 - lost, views)
         for degrees in (kept, kept + 70, np.where(kept > 40, kept + lost, kept), np.where(kept > 40, kept + 180, kept)):
             step = (180 - lost) / (views - 1)
-            assert half_turn_unseen(np.radians(degrees)) == pytest.approx(lost, abs=step + 1e-6)
+            assert degrees_without_projection(np.radians(degrees)) == pytest.approx(lost, abs=step + 1e-6)
     for degrees in (np.r_[0:40:0.5, 90:130:0.5], np.r_[0:20:0.5, 90:110:0.5]):  # twice the same gap
-        assert half_turn_unseen(np.radians(degrees)) == pytest.approx(180 - degrees.size / 2, abs=0.1)
+        assert degrees_without_projection(np.radians(degrees)) == pytest.approx(180 - degrees.size / 2, abs=0.1)

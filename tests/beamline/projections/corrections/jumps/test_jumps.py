@@ -47,7 +47,7 @@ def moved(x: float, z: float) -> NDArray[np.float32]:
 
 def test_views_after_a_jump_are_left_out(tmp_path: Path) -> None:
     found, told = prepared(scan(tmp_path, moved(1.5, 1.0), JUMP), replace(SELECTION, views="first:30"))
-    assert found.geometry.n_views == 30 and found.origin.left_out == 19 and found.sources.of_views is None
+    assert found.geometry.n_views == 30 and found.origin.left_out == 19 and found.sources.view_weights is None
     assert "The sample jumped at frame 45. 19 projections are left out" in told
     assert "`--calibrate shifts` uses all" in told and found.origin.done["jumps"].sentence in told
 
