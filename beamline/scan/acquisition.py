@@ -16,10 +16,17 @@ from beamline.plan.plan import Block, Timeline, middle_of_exposure, retake_block
 from beamline.scan.control import State
 from beamline.scan.exposures import Exposures
 from beamline.scan.ledger import LedgerError
-from beamline.scan.moves import in_words, make_safe, remembered_places, require_in_place, set_shutter_and_sample
+from beamline.scan.moves import in_words, make_safe, position_checks_of, require_in_place, set_shutter_and_sample
 from beamline.scan.references import REFERENCES, copied
 from beamline.scan.supervision import Supervision
-from beamline.scan.tally import BlockTally, astray_views, discrepancies, first_taken, missing_views, recover
+from beamline.scan.tally import (
+    BlockTally,
+    discrepancies,
+    missing_views,
+    off_target_sentence,
+    projection_tallies,
+    recover,
+)
 from beamline.scan.waits import SLICE
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError
@@ -63,13 +70,13 @@ class Acquisition:
     @property
     def n_frames(self) -> int:
         """Number of frames delivered so far."""
-        return sum(taken.frames for taken in self._done)
+        return sum(tally.frames for tally in self._done)
 
     @property
     def missing(self) -> list[int]:
         """Triggers (counted over the whole plan) that gave no frame so far. Triggers that were not reached yet do not
         count."""
-        return [taken.block.first_trigger + i for taken in self._done if not taken.again for i in taken.missing]
+        return [tally.block.first_trigger + i for tally in self._done if not tally.is_retake for i in tally.missing]
 
     def frames(self) -> Generator[Frame, None, None]:
         """Yields the frames, each with its own memory, its row in the file, its trigger and its angle.
@@ -127,8 +134,8 @@ class Acquisition:
                 self._done.append(BlockTally(block))
                 continue
             views = block.kind is FrameKind.PROJECTION and not self._stop.stopping
-            if views and (refused := self._supervision.refusal()):
-                self._refused = refused
+            if views and (refusal := self._supervision.refusal()):
+                self._refused = refusal
                 return
             # Laterally offset projections may have been taken already, if they were chosen after a pass.
             if any(t.block is block for t in self._done) or (self._stop.stopping and not self._still_needed(block)):
@@ -151,22 +158,22 @@ class Acquisition:
         first.
         """
         plan, blocks = self._timeline.plan, [block for block in self._timeline.blocks if block.n_to_take]
-        offset = [block for block in blocks if block.kind is FrameKind.OFFSET_VIEW]
-        passes = passes_at_start(views, plan.pass_views * plan.frames_per_view, plan.choices, offset)
+        offset_blocks = [block for block in blocks if block.kind is FrameKind.OFFSET_VIEW]
+        passes = passes_at_start(views, plan.pass_views * plan.frames_per_view, plan.choices, offset_blocks)
         choice, ended_before = Choice((Choice.NEXT, *plan.choices)[-1]), plan.choice_due
         unfinished = replace(views, stored=frozenset(range(views.n)) - triggers_to_take(*passes.done) | views.stored)
-        blocks = [*([unfinished] if unfinished.n_to_take else []), *(offset if choice is Choice.OFFSET else [])]
+        blocks = [*([unfinished] if unfinished.n_to_take else []), *(offset_blocks if choice is Choice.OFFSET else [])]
         if not self._done:  # no darks or flats were taken before, and the decision may come first
             self._done.append(BlockTally(replace(views, stored=frozenset(range(views.n)))))
             self._supervision.states.enter(_state_of(views))
         while True:
-            again = passes.done[-1] in passes.done[:-1]
+            is_repeated = passes.done[-1] in passes.done[:-1]
             for block in blocks:
                 if self._stop.stopping:
                     return False
-                taken = BlockTally(block, again)
-                yield from self._offset(block) if block.kind is FrameKind.OFFSET_VIEW else self._block(taken)
-                self.recovered += recover(self._done, taken.rows)
+                tally = BlockTally(block, is_repeated)
+                yield from self._offset(block) if block.kind is FrameKind.OFFSET_VIEW else self._block(tally)
+                self.recovered += recover(self._done, tally.rows)
             if choice is Choice.RETAKE:
                 yield from self._retake(views)
             if self._stop.stopping:
@@ -182,29 +189,29 @@ class Acquisition:
                 return True
             if self._stop.stopping or (choice is Choice.NEXT and not passes.to_come):
                 return False
-            before, passes = passes, passes.after(choice)
-            blocks = [*passes.done[len(before.done) :], *before.offset[len(passes.offset) :]]
+            passes_before, passes = passes, passes.after(choice)
+            blocks = [*passes.done[len(passes_before.done) :], *passes_before.offset[len(passes.offset) :]]
 
-    def _block(self, taken: BlockTally) -> Iterator[Frame]:
-        block = taken.block
-        self._done.append(taken)
-        what = block.kind.name.lower(), str(block.mode), block.n_to_take, self.n_frames
-        self._sink(BlockStarted(*what, block.exposure, block.period))
+    def _block(self, tally: BlockTally) -> Iterator[Frame]:
+        block = tally.block
+        self._done.append(tally)
+        block_values = block.kind.name.lower(), str(block.mode), block.n_to_take, self.n_frames
+        self._sink(BlockStarted(*block_values, block.exposure, block.period))
         self._supervision.states.enter(_state_of(block))
-        if recorded := self._supervision.recorded(block):
-            yield from copied(taken, recorded, self.n_frames)
+        if recorded_frames := self._supervision.recorded(block):
+            yield from copied(tally, recorded_frames, self.n_frames)
         else:
-            yield from self._exposed(taken)
-        self._sink(BlockDone(*what, taken.frames, taken.missing, taken.lost, taken.ignored, taken.extra))
+            yield from self._exposed(tally)
+        self._sink(BlockDone(*block_values, tally.frames, tally.missing, tally.lost, tally.ignored, tally.extra))
 
-    def _exposed(self, taken: BlockTally) -> Iterator[Frame]:
-        block = taken.block
+    def _exposed(self, tally: BlockTally) -> Iterator[Frame]:
+        block = tally.block
         set_shutter_and_sample(self._devices, block, self._warm_up)
-        first, looks = self.n_frames, remembered_places(self._devices, block.kind, self._stop)
-        yield from self._exposures.take(taken, first)
-        require_in_place(looks, block.kind, range(first, self.n_frames), self._stop)
-        if len(taken.astray) > 1:
-            self._sink(Warned(astray_views(taken)))
+        first_row, position_checks = self.n_frames, position_checks_of(self._devices, block.kind, self._stop)
+        yield from self._exposures.take(tally, first_row)
+        require_in_place(position_checks, block.kind, range(first_row, self.n_frames), self._stop)
+        if len(tally.off_target) > 1:
+            self._sink(Warned(off_target_sentence(tally)))
         if block.kind is FrameKind.FLAT:
             self._devices.sample.back()
 
@@ -218,22 +225,22 @@ class Acquisition:
         if not retakes:
             return
         triggers = np.array([retake.trigger for retake in retakes], np.int64)
-        beyond = middle_of_exposure(views)[triggers]
-        n_repeated = sum(before.block.n_to_take for before in self._done if before.again)
-        taken = BlockTally(retake_block(views, triggers), again=True)
-        for frame in self._block(taken):
+        angle_to_middle = middle_of_exposure(views)[triggers]
+        n_repeated = sum(earlier_tally.block.n_to_take for earlier_tally in self._done if earlier_tally.is_retake)
+        tally = BlockTally(retake_block(views, triggers), is_retake=True)
+        for frame in self._block(tally):
             i = frame.trigger
-            angle, row, trigger = frame.angle - float(beyond[i]), retakes[i].row, views.n + n_repeated + i
+            angle, row, trigger = frame.angle - float(angle_to_middle[i]), retakes[i].row, views.n + n_repeated + i
             if frame.kind is FrameKind.INVALID:
                 yield replace(frame, trigger=trigger)
                 continue
             if row < 0:
                 trigger = retakes[i].trigger
                 self.recovered += recover(self._done, [trigger])
-            rows_astray = [astray_row for astray_row, _ in taken.astray.get(i, [])]
+            rows_astray = [astray_row for astray_row, _ in tally.off_target.get(i, [])]
             replaces = -1 if frame.replaces in rows_astray else frame.replaces
             yield replace(frame, angle=angle, trigger=trigger, replaces=max(row, replaces))
-        if rows := [retakes[i].row for i in taken.missing if retakes[i].row >= 0]:
+        if rows := [retakes[i].row for i in tally.missing if retakes[i].row >= 0]:
             self._sink(
                 Warned(f"Frames {spans(rows)}: the exposure was repeated, but the camera again delivered no frame.")
             )
@@ -243,12 +250,12 @@ class Acquisition:
         projections."""
         views = self._timeline.views
         # every pass has the same direction; a single pulse has no direction
-        beyond = float(max(middle_of_exposure(views), key=abs))
+        angle_to_middle = float(max(middle_of_exposure(views), key=abs))
         # in files, laterally offset projections also have the kind projection
-        first = block.first_trigger - views.first_trigger
+        first_trigger = block.first_trigger - views.first_trigger
         for frame in self._block(BlockTally(block)):
-            invalid = frame.kind is FrameKind.INVALID
-            yield frame if invalid else replace(frame, angle=frame.angle - beyond, trigger=first + frame.trigger)
+            angle, trigger = frame.angle - angle_to_middle, first_trigger + frame.trigger
+            yield frame if frame.kind is FrameKind.INVALID else replace(frame, angle=angle, trigger=trigger)
 
     def _still_needed(self, block: Block) -> bool:
         """True if a stopped scan still needs this block: the scan has projections, and the block has darks or flats of
@@ -256,7 +263,7 @@ class Acquisition:
 
         A stop during the block itself ends it, because each block is considered once.
         """
-        kinds = {taken.block.kind for taken in self._done if taken.frames}
+        kinds = {tally.block.kind for tally in self._done if tally.frames}
         return block.kind in REFERENCES and FrameKind.PROJECTION in kinds and block.kind not in kinds
 
     def _warm_up(self) -> None:
@@ -299,7 +306,9 @@ class Acquisition:
     def _raise_outcome(self) -> None:
         blocks = [block for block in self._timeline.blocks if block.kind is FrameKind.PROJECTION]
         planned = sum(block.n for block in blocks)
-        views = sum(len(taken.rows) for taken in first_taken(self._done)) + sum(len(block.stored) for block in blocks)
+        views = sum(len(tally.rows) for tally in projection_tallies(self._done)) + sum(
+            len(block.stored) for block in blocks
+        )
         if self._stop.aborting:
             raise ScanAborted(f"Aborted: {self._stop.reason}.{discrepancies(self._done)}")
         if self._refused:

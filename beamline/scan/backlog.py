@@ -64,29 +64,29 @@ def hold_for_space(pause: PauseRequest, reserve: int, free: int, remaining: int)
 
     Args:
         reserve: bytes that must stay free for frames that still come after the pause was requested. free: free bytes of
-            the disk. left: bytes that must still be written.
+            the disk. remaining: bytes that must still be written.
     """
-    again = min(2 * reserve, remaining) + CLOSING
+    enough = min(2 * reserve, remaining) + CLOSING
     if remaining and free < min(reserve, remaining) + CLOSING:
         pause.hold(
             Cause.SPACE,
             f"Free some space on the scan's disk: {size(free)} are free, and {size(remaining)} are still to be "
-            f"written. The scan continues automatically when {size(again)} are free",
+            f"written. The scan continues automatically when {size(enough)} are free",
         )
-    elif not remaining or free >= again:
+    elif not remaining or free >= enough:
         pause.release(Cause.SPACE)
 
 
-def hold_for_backlog(pause: PauseRequest, most: int, waiting: int, checking: float, writing: float) -> None:
+def hold_for_backlog(pause: PauseRequest, limit: int, waiting: int, checking: float, writing: float) -> None:
     """Pause a fly scan before the queue is full. The pause lasts until only few frames wait to be written.
 
     Args:
-        most: limit for the number of waiting frames.
+        limit: limit for the number of waiting frames.
         waiting: number of waiting frames.
         checking, writing: time in s for which the threads of the recorder were busy. If writing took longer, the disk
             is too slow.
     """
-    if 4 * waiting >= 3 * most:
+    if 4 * waiting >= 3 * limit:
         what, advice = (
             ("The disk is too slow", "a longer period_s or a faster disk")
             if writing > checking
@@ -97,10 +97,10 @@ def hold_for_backlog(pause: PauseRequest, most: int, waiting: int, checking: flo
         )
         pause.hold(
             Cause.BACKLOG,
-            f"{what}: {waiting} of at most {most} frames wait in memory. The scan pauses, and continues "
+            f"{what}: {waiting} of at most {limit} frames wait in memory. The scan pauses, and continues "
             f"automatically when most of these frames are written. To avoid such pauses, use {advice}",
         )
-    elif 4 * waiting <= most:
+    elif 4 * waiting <= limit:
         pause.release(Cause.BACKLOG)
 
 
@@ -110,9 +110,9 @@ class DiskSpace:
     def __init__(self, pause: PauseRequest, folder: Path, timeline: Timeline) -> None:
         self._pause, self._folder, self._looked_at = pause, folder, -math.inf
         self._row_bytes = timeline.total_bytes // timeline.n_frames
-        on_the_way = math.ceil(BRAKING / timeline.views.period) if timeline.views.trains else 1
-        in_work = CHECKED_FRAMES + 2
-        self._reserve = self._row_bytes * (room(timeline) + in_work + on_the_way)
+        frames_while_braking = math.ceil(BRAKING / timeline.views.period) if timeline.views.trains else 1
+        frames_in_threads = CHECKED_FRAMES + 2
+        self._reserve = self._row_bytes * (room(timeline) + frames_in_threads + frames_while_braking)
 
     def look(self, n_left: int) -> None:
         """Look at the free space if the last look was longer ago than LOOK. `n_left` frames must still be written."""
@@ -143,11 +143,11 @@ class FrameProgress:
 
     def expect_fewer(self, done: int, n: int) -> None:
         """Subtract `n` frames: the next `n` planned frames after `done` frames will not come."""
-        remaining = min(done + n, self.total)
+        first_remaining = min(done + n, self.total)
         self._ahead = np.append(
-            self._ahead[:done] - self._ahead[done] + self._ahead[remaining], self._ahead[remaining:]
+            self._ahead[:done] - self._ahead[done] + self._ahead[first_remaining], self._ahead[first_remaining:]
         )
-        self.total -= remaining - done
+        self.total -= first_remaining - done
 
     def update(self, frame: Frame, n: int, mean: float) -> FrameStored | None:
         """Record the n-th frame. Returns None if the last event was less than EVENT_INTERVAL ago."""

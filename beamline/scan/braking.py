@@ -18,14 +18,14 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 from beamline.scan.ledger import EXTRA, DeliveredFrame, Ledger, enter, start_known
-from beamline.scan.tally import Exposed
+from beamline.scan.tally import ExposedFrame
 from drivers.base.protocols import CameraFrame, TriggerTrain
 
 EARLY, LATE = 0.02, 0.5  # s: braking begins at most this time before the stop was sent, and at most this time after it
 MOST = 0.75  # share of the triggers that must have a frame at their times; by chance the share is 0.4
 FEW = 4  # number of triggers; with fewer exposures the motion cannot be tested
 SHRINKS = 0.2  # periods by which an interval may be shorter than the one before
-BESIDE = 0.02  # intervals: a stage that stands this close to a trigger may or may not have passed it
+NEAR_TRIGGER = 0.02  # intervals: a stage that stands this close to a trigger may or may not have passed it
 
 
 @dataclass(frozen=True)
@@ -46,19 +46,23 @@ unknown."""
 def placing(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> Placing:
     """The way to assign frames that arrived during braking: by the motion of the stage, by their number, or not at
     all."""
-    steady, moved, counted = (assigned(ledger, braking, frames, way) for way in (unassigned, by_motion, by_number))
-    fewest, most = (min(math.floor(braking.position + by), ledger.train.n - 1) for by in (-BESIDE, BESIDE))
-    due = fewest - steady.last
-    if _matched(moved) - _matched(steady) >= MOST * due:
+    ledger_before, ledger_by_motion, ledger_by_number = (
+        assigned(ledger, braking, frames, assign_frame) for assign_frame in (unassigned, by_motion, by_number)
+    )
+    fewest, most = (
+        min(math.floor(braking.position + tolerance), ledger.train.n - 1) for tolerance in (-NEAR_TRIGGER, NEAR_TRIGGER)
+    )
+    n_due = fewest - ledger_before.last_trigger
+    if _matched(ledger_by_motion) - _matched(ledger_before) >= MOST * n_due:
         return by_motion
-    all_counted = fewest <= counted.last <= most and counted.unconfirmed == ledger.unconfirmed
-    return by_number if due >= FEW and all_counted and _ever_slower(ledger, braking, frames) else unassigned
+    all_counted = fewest <= ledger_by_number.last_trigger <= most and ledger_by_number.unconfirmed == ledger.unconfirmed
+    return by_number if n_due >= FEW and all_counted and _intervals_increase(ledger, braking, frames) else unassigned
 
 
-def assigned(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame], way: Placing) -> Ledger:
+def assigned(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame], assign_frame: Placing) -> Ledger:
     """The ledger after all frames were assigned to triggers in this way."""
     for i in range(len(frames)):
-        entered = enter(ledger, [way(ledger, braking, frame) for frame in frames[i:]], last=True)
+        entered = enter(ledger, [assign_frame(ledger, braking, frame) for frame in frames[i:]], last=True)
         ledger = ledger if entered is None else entered[0]
     return ledger
 
@@ -66,27 +70,29 @@ def assigned(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame],
 def by_motion(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
     """Assign the frame to the position that a constant deceleration reaches at its time."""
     train = ledger.train
-    if ledger.last >= 0:
-        last, phase, period = ledger.last, ledger.phase, ledger.period
-    elif train.first is not None and start_known(train):
-        last, phase, period = 0, train.first, train.period
+    if ledger.last_trigger >= 0:
+        last, phase, period = ledger.last_trigger, ledger.phase, ledger.period
+    elif train.first_time is not None and start_known(train):
+        last, phase, period = 0, train.first_time, train.period
     else:
         return unassigned(ledger, braking, frame)
-    seconds = 1 / (period * braking.deceleration)
-    began = phase + (braking.position - last) * period - seconds / 2
+    full_braking_seconds = 1 / (period * braking.deceleration)
+    began = phase + (braking.position - last) * period - full_braking_seconds / 2
     if not -EARLY <= began - braking.stop_sent <= LATE:
         return unassigned(ledger, braking, frame)
     if frame.time <= began:
         return frame
-    braked = min(frame.time - began, seconds)
-    return DeliveredFrame(frame.framestamp, began + braked - braked**2 / (2 * seconds), steady=False)
+    braking_seconds = min(frame.time - began, full_braking_seconds)
+    return DeliveredFrame(
+        frame.framestamp, began + braking_seconds - braking_seconds**2 / (2 * full_braking_seconds), steady=False
+    )
 
 
 def by_number(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
     """Assign the frame by the number of exposures since the last one at constant speed."""
-    if frame.time < braking.stop_sent or ledger.last < 0:
+    if frame.time < braking.stop_sent or ledger.last_trigger < 0:
         return unassigned(ledger, braking, frame)
-    exposures = ledger.unmatched + frame.framestamp - ledger.exposed
+    exposures = ledger.unmatched + frame.framestamp - ledger.last_framestamp
     return DeliveredFrame(frame.framestamp, ledger.phase + exposures * ledger.period, steady=False)
 
 
@@ -96,17 +102,17 @@ def unassigned(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> Deliv
 
 
 def _matched(ledger: Ledger) -> int:
-    return ledger.last + 1 - len(ledger.missing)
+    return ledger.last_trigger + 1 - len(ledger.missing)
 
 
-def _ever_slower(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> bool:
+def _intervals_increase(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> bool:
     """True if the intervals between exposures increase after the last exposure at constant speed."""
     steady = [
-        DeliveredFrame(ledger.exposed, ledger.phase),
+        DeliveredFrame(ledger.last_framestamp, ledger.phase),
         *(frame for frame in frames if frame.time < braking.stop_sent),
     ]
-    came = [steady[-1], *(frame for frame in frames if frame.time >= braking.stop_sent)]
-    intervals = [(b.time - a.time) / (b.framestamp - a.framestamp) for a, b in pairwise(came)]
+    last_and_braking = [steady[-1], *(frame for frame in frames if frame.time >= braking.stop_sent)]
+    intervals = [(b.time - a.time) / (b.framestamp - a.framestamp) for a, b in pairwise(last_and_braking)]
     period = ledger.train.period
     return all(later > before - SHRINKS * period for before, later in pairwise([period, *intervals]))
 
@@ -116,15 +122,15 @@ class FlownTrain:
     """A pulse train of a fly scan while the stage moves.
 
     Attributes:
-        first: first trigger of the train within the block. seconds: duration of the move. stop_sent: time at which a
-            stop was sent to the stage during the pass. paused: True for a pause; the triggers after the last stored
-            frame are then exposed again after the pause. braking: for a stop, the data on the braking, as soon as the
-            stage has stopped. waiting: frames whose trigger can be determined only with later frames.
+        first_trigger: first trigger of the train within the block. seconds: duration of the move. stop_sent: time at
+            which a stop was sent to the stage during the pass. paused: True for a pause; the triggers after the last
+            stored frame are then exposed again after the pause. braking: for a stop, the data on the braking, as soon
+            as the stage has stopped. waiting: frames whose trigger can be determined only with later frames.
     """
 
     ledger: Ledger
     train: TriggerTrain
-    first: int
+    first_trigger: int
     seconds: float
     stop_sent: float = math.inf
     paused: bool = False
@@ -140,11 +146,11 @@ class FlownTrain:
     def last_due(self) -> float:
         """The time at which the last trigger of the pass is due, in s since the Unix epoch; inf if it is not known."""
         ledger, train = self.so_far, self.ledger.train
-        if ledger.last >= 0:
-            return ledger.phase + (train.n - 1 - ledger.last) * ledger.period
-        return math.inf if train.first is None else train.first + (train.n - 1) * train.period
+        if ledger.last_trigger >= 0:
+            return ledger.phase + (train.n - 1 - ledger.last_trigger) * ledger.period
+        return math.inf if train.first_time is None else train.first_time + (train.n - 1) * train.period
 
-    def enter(self, *frames: CameraFrame, last: bool = False) -> Iterator[Exposed]:
+    def enter(self, *frames: CameraFrame, last: bool = False) -> Iterator[ExposedFrame]:
         """Enter frames. Yields the frames whose trigger is now known (or EXTRA), with the trigger in the block and the
         angle.
 
@@ -152,16 +158,16 @@ class FlownTrain:
             last: True if no further frame will come; then no frame waits.
         """
         self.waiting += frames
-        brakes = self.braking is not NOT_BRAKING
-        if brakes and not last:
+        is_braking = self.braking is not NOT_BRAKING
+        if is_braking and not last:
             return
-        way = placing(self.ledger, self.braking, self._exposed) if brakes else unassigned
+        assign_frame = placing(self.ledger, self.braking, self._exposed) if is_braking else unassigned
         while self.waiting:
-            exposed = [way(self.ledger, self.braking, frame) for frame in self._exposed]
+            exposed = [assign_frame(self.ledger, self.braking, frame) for frame in self._exposed]
             if (entered := enter(self.ledger, exposed, last)) is None:
                 return
             self.ledger, entry = entered
-            trigger = EXTRA if entry.trigger == EXTRA else self.first + entry.trigger
+            trigger = EXTRA if entry.trigger == EXTRA else self.first_trigger + entry.trigger
             yield self.waiting.pop(0), trigger, entry.angle, True
 
     @property

@@ -97,7 +97,7 @@ class Verb(StrEnum):
 
 
 @contextmanager
-def verbs_taken(
+def commands_taken(
     folder: Path, stop: StopRequest, pause: PauseRequest, choose: Callable[[Choice], None] = lambda choice: None
 ) -> Iterator[None]:
     """A context in which the scan of this folder carries out commands. They are files in a folder that only the owner
@@ -109,38 +109,38 @@ def verbs_taken(
     Raises:
         DataError: the folder for the commands cannot be created.
     """
-    place, over = folder / CONTROL, threading.Event()
+    commands_folder, ended = folder / CONTROL, threading.Event()
     actions: Mapping[Verb | Choice, Callable[[], None]] = {
         Verb.ABORT: stop.abort, Verb.STOP: stop.stop, Verb.PAUSE: pause.pause, Verb.RESUME: pause.resume,
         **{choice: partial(choose, choice) for choice in Choice},
     }  # fmt: skip
 
     def take_verbs() -> None:
-        while not over.wait(POLL):
-            for verb, action in actions.items():
-                if _taken(place / verb):
+        while not ended.wait(POLL):
+            for command, action in actions.items():
+                if _remove_request(commands_folder / command):
                     action()
 
     try:
-        place.mkdir(mode=0o700)
+        commands_folder.mkdir(mode=0o700)
     except OSError as error:
         raise DataError(
-            f"{place} cannot be created ({error.strerror}). Nothing has moved, and no frame was recorded."
+            f"{commands_folder} cannot be created ({error.strerror}). Nothing has moved, and no frame was recorded."
         ) from error
     thread = threading.Thread(target=take_verbs, name="control", daemon=True)
     thread.start()
     try:
         yield
     finally:
-        over.set()
+        ended.set()
         thread.join(ANSWER_WITHIN)
-        for verb in actions:
-            _taken(place / verb)
+        for command in actions:
+            _remove_request(commands_folder / command)
         with suppress(OSError):
-            place.rmdir()
+            commands_folder.rmdir()
 
 
-def _taken(request: Path) -> bool:
+def _remove_request(request: Path) -> bool:
     """Remove a request; False if there is none."""
     try:
         request.unlink()
@@ -151,8 +151,8 @@ def _taken(request: Path) -> bool:
 
 def running(runs: Path) -> list[Path]:
     """The runs in a folder, also those of a series, whose scan is in progress, oldest first."""
-    within = [place for folder in series_in(runs) for place in folder.glob("*/")]
-    return sorted(run for run in (*runs.glob("*/"), *within) if alive(parts_of(run)[-1]))
+    runs_in_series = [place for folder in series_in(runs) for place in folder.glob("*/")]
+    return sorted(run for run in (*runs.glob("*/"), *runs_in_series) if alive(parts_of(run)[-1]))
 
 
 def series_in(folder: Path) -> list[Path]:
@@ -161,11 +161,11 @@ def series_in(folder: Path) -> list[Path]:
 
 
 @dataclass(frozen=True)
-class Asked:
+class SentCommand:
     """A command sent to the scan of a part of a run, with its time on the monotonic clock."""
 
     part: Path
-    verb: Verb | Choice
+    command: Verb | Choice
     since: float
 
     def state(self) -> State | None:
@@ -175,21 +175,21 @@ class Asked:
         Raises:
             ConfigError: the scan has not answered for 5 s. The request is withdrawn.
         """
-        request, seconds = self.part / CONTROL / self.verb, time.monotonic() - self.since
+        request, seconds = self.part / CONTROL / self.command, time.monotonic() - self.since
         if request.exists():
             if seconds < ANSWER_WITHIN:
                 return None
-            if _taken(request):
+            if _remove_request(request):
                 raise ConfigError(
                     f"the scan in {self.part} does not answer: either its process was killed, or its disk hangs. "
                     "Nothing was changed. If the process was killed, check the instrument, and run `beamline "
                     "recover` on the scan file."
                 )
         state = state_of(self.part)
-        return state if _done(state, self.verb) or seconds > EFFECT_WITHIN else None
+        return state if _is_carried_out(state, self.command) or seconds > EFFECT_WITHIN else None
 
 
-def ask(run: Path, verb: Verb | Choice) -> Asked:
+def ask(run: Path, verb: Verb | Choice) -> SentCommand:
     """Send a command to a running scan without waiting, so that the next command can follow at once.
 
     Args:
@@ -216,15 +216,15 @@ def ask(run: Path, verb: Verb | Choice) -> Asked:
             f"{run} does not accept {verb}: {error.strerror}. Only the user who started a scan can control the scan; "
             "Ctrl-C at its terminal stops the scan."
         ) from error
-    return Asked(part, verb, time.monotonic())
+    return SentCommand(part, verb, time.monotonic())
 
 
 def tell(run: Path, verb: Verb | Choice) -> State:
     """Send a command to a running scan, and wait until it is done. Returns the state. Raises the errors of `ask` and
-    `Asked`.
+    `SentCommand`.
     """
-    asked = ask(run, verb)
-    while (state := asked.state()) is None:
+    sent = ask(run, verb)
+    while (state := sent.state()) is None:
         time.sleep(POLL)
     return state
 
@@ -235,7 +235,7 @@ def state_of(part: Path) -> State:
     return State.IDLE if record is None else states.get(record.state, State.IDLE)
 
 
-def _done(state: State, verb: Verb | Choice) -> bool:
+def _is_carried_out(state: State, verb: Verb | Choice) -> bool:
     """True if a scan in this state has carried out the command."""
     if state is State.FINISHING or state.ended:
         return True

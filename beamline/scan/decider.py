@@ -98,10 +98,10 @@ class Decider:
         if self.stop.stopping:
             return Choice.NEXT
         if law is not None:
-            spent = self._spent(passes)
-            by, (choice, reason) = "program", choose(offered, self.target, remaining_gain(passes, law), *spent)
+            used = self._used_so_far(passes)
+            decided_by, (choice, reason) = "program", choose(offered, self.target, remaining_gain(passes, law), *used)
         else:
-            by, choice, self._no_more_laws = "plan", Choice.NEXT, self.why_no_law()
+            decided_by, choice, self._no_more_laws = "plan", Choice.NEXT, self.why_no_law()
             reason = (
                 self._no_more_laws
                 or (self._law.reason if self._law.number == self.number else "")
@@ -111,18 +111,20 @@ class Decider:
             self.asks and not self._no_more_laws,
             "" if law else f"The expected improvement is not known: {reason}.",
         )
-        pass_ended, done = (self.number, passes.n_frames // self.timeline.plan.frames_per_view), len(passes.done)
+        pass_values, n_passes = (self.number, passes.n_frames // self.timeline.plan.frames_per_view), len(passes.done)
         rows = [  # an event has None for NaN
             {name: None if value != value else value for name, value in vars(option).items()} for option in offered
         ]
-        self.sink(PassEnded(*pass_ended, rows, choice, self.wait if asks else 0.0, remark, done))
+        self.sink(PassEnded(*pass_values, rows, choice, self.wait if asks else 0.0, remark, n_passes))
         if asks:
-            by, choice, reason = self._ask(choice, offered)
+            decided_by, choice, reason = self._ask(choice, offered)
             if self.stop.stopping:
                 return Choice.NEXT
         self._chosen[self.number] = {row["choice"]: row for row in rows}.get(choice, {})
-        dropped = passes.n_planned - passes.after(choice).n_planned
-        event = NextChosen(*pass_ended, choice, by, reason, rows, **self._outcome, passes=done, dropped=dropped)
+        n_dropped = passes.n_planned - passes.after(choice).n_planned
+        event = NextChosen(
+            *pass_values, choice, decided_by, reason, rows, **self._outcome, passes=n_passes, dropped=n_dropped
+        )
         self._outcome = {}
         self.sink(event)
         self.record({"predicted": None, "gained": None} | event.data)
@@ -140,16 +142,16 @@ class Decider:
             law is None
             or self.asks
             or self.why_no_law()
-            or not next_is_sure(passes, offered, self.target, law, *self._spent(passes))
+            or not next_is_sure(passes, offered, self.target, law, *self._used_so_far(passes))
         ):
-            if not self._law_has_come():
+            if not self._law_is_known():
                 self.close_shutter()  # computing an error model takes seconds
-                self._wait(self._law_has_come)
+                self._wait(self._law_is_known)
             law = self._newest_law(passes) if self._law.number == self.number else None
             offered = options(passes, law, self.timeline, self.seconds_of)
         return law, offered
 
-    def _law_has_come(self) -> bool:
+    def _law_is_known(self) -> bool:
         """True if the error model of all projections so far has arrived, or if no error model can come."""
         return self._law.number == self.number or bool(self.why_no_law())
 
@@ -165,7 +167,7 @@ class Decider:
             return None
         return ErrorLaw(passes.n_frames, *values)
 
-    def _spent(self, passes: Passes) -> tuple[float, float]:
+    def _used_so_far(self, passes: Passes) -> tuple[float, float]:
         """Seconds and share of the dose that the scan has used, plus those of the frames that follow the passes in any
         case."""
         retaken = sum(option["frames"] for option in self._chosen.values() if option.get("choice") is Choice.RETAKE)

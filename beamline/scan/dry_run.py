@@ -67,8 +67,8 @@ class DryRun:
     Attributes:
         disk: an existing folder on the disk of the file.
         needs: needs of all scans, including the time between states.
-        every: time in s from the beginning of one state to the beginning of the next; None: another program decides
-            when a state begins.
+        state_interval: time in s from the beginning of one state to the beginning of the next; None: another
+            program decides when a state begins.
     """
 
     plan: ScanPlan
@@ -80,7 +80,7 @@ class DryRun:
     disk: Path
     energies: tuple[EnergyNeeds, ...] = ()
     states: tuple[StateNeeds, ...] = ()
-    every: float | None = None
+    state_interval: float | None = None
 
     def lines(self) -> list[str]:
         """The plan as lines of text. Violations are not included; `refuse_violations` reports them."""
@@ -102,7 +102,7 @@ class DryRun:
         return [*lines, *(f"{'operator':<10}{what}, {count(times, 'time')}" for what, times in needs.operator)]
 
     def _states_in_words(self) -> str:
-        longest, every = max(one.duration for one in self.states), self.every
+        longest, every = max(needs.duration for needs in self.states), self.state_interval
         when = "at the next `beamline resume`" if every is None else f"one every {hms_text(every)}"
         late = every is not None and longest > every
         more = f"; a state takes {hms_text(longest)}, so the next state begins later than planned" if late else ""
@@ -113,26 +113,26 @@ class DryRun:
 
     def data(self) -> Mapping[str, Any]:
         """The numbers in these lines, for programs, in s, rad, bytes and pixels."""
-        worked, views = self.timeline, self.timeline.views
+        timeline, views = self.timeline, self.timeline.views
         return {
             **self.needs.data(),
-            "remarks": worked.remarks,
-            "duration": worked.duration,
-            "n_frames": worked.n_frames,
-            "total_bytes": worked.total_bytes,
+            "remarks": timeline.remarks,
+            "duration": timeline.duration,
+            "n_frames": timeline.n_frames,
+            "total_bytes": timeline.total_bytes,
             "free_bytes": self.free_bytes,
-            "step_counts": worked.step_counts,
-            "step": worked.step,
+            "step_counts": timeline.step_counts,
+            "step": timeline.step,
             "speed": views.speed,
             "taxi": views.taxi,
-            "blur_px": worked.blur_px,
-            "skew_px": worked.skew_px,
+            "blur_px": timeline.blur_px,
+            "skew_px": timeline.skew_px,
             "min_period": self.camera.min_period,
             "energies": [need._asdict() for need in self.energies],
             "states": [need._asdict() for need in self.states],
             "blocks": [
                 {"kind": b.kind.name.lower(), "mode": b.mode, "first_row": row, "n": b.n_to_take}
-                for b, row in zip(worked.blocks, worked.first_rows, strict=True)
+                for b, row in zip(timeline.blocks, timeline.first_rows, strict=True)
             ],
         }
 
@@ -140,8 +140,8 @@ class DryRun:
 def doubts(config: Config) -> list[str]:
     """Warnings about implausible values, for example because of a wrong unit; empty if all values are plausible."""
     theta = np.degrees(plan_of(config).angles)
-    ends = float(np.ptp(theta))
-    spans = getattr(config.scan.angles, "span_deg", ends), ends, ends * theta.size / max(theta.size - 1, 1)
+    span = float(np.ptp(theta))
+    spans = getattr(config.scan.angles, "span_deg", span), span, span * theta.size / max(theta.size - 1, 1)
     sentences = [
         *(doubt(".".join(key), value) for key, value in quantities(config.model_dump(exclude={"simulation"}))),
         next(filter(None, map(doubt_span, spans)), ""),
@@ -158,22 +158,22 @@ def _doubt_optics(config: Config) -> str:
     """A sentence if pixel size and distance do not match the camera, for example because of a wrong unit; otherwise
     empty.
     """
-    optics, camera, own = config.optics, config.devices.camera, 1e3 * PITCH_MM
+    optics, camera, camera_pixel_um = config.optics, config.devices.camera, 1e3 * PITCH_MM
     settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
     # half of the width of the field of view, in mm
-    half = 5e-4 * optics.pixel_size_um * camera.binning * camera.timing_of(settings).shape[1]
-    field_of_view = 2 * half
-    if optics.pixel_size_um > _DEMAGNIFIED * own:
+    half_width = 5e-4 * optics.pixel_size_um * camera.binning * camera.timing_of(settings).shape[1]
+    field_of_view = 2 * half_width
+    if optics.pixel_size_um > _DEMAGNIFIED * camera_pixel_um:
         return (
-            f"optics.pixel_size_um is {optics.pixel_size_um:g} um, but the camera's pixels are {own:g} um: the field "
-            f"of view would be {field_of_view:.4g} mm wide. The setting is the size of an unbinned pixel at the "
-            "sample, in um. Was the value given in nm?"
+            f"optics.pixel_size_um is {optics.pixel_size_um:g} um, but the camera's pixels are {camera_pixel_um:g} um: "
+            f"the field of view would be {field_of_view:.4g} mm wide. The setting is the size of an unbinned pixel "
+            "at the sample, in um. Was the value given in nm?"
         )
     return (
         f"optics.distance_mm is {optics.distance_mm:g} mm from sample to detector, less than half the field of view "
         f"of {field_of_view:.4g} mm: a sample as wide as the field of view could not rotate there. Was the value given "
         "in m?"
-        if optics.distance_mm and optics.distance_mm < half
+        if optics.distance_mm and optics.distance_mm < half_width
         else ""
     )
 
@@ -182,7 +182,7 @@ def dry_run(
     settings: Config,
     runs: Path | None = None,
     remaining: Remaining = all_of,
-    whole: Collection[float | None] = (),
+    complete: Collection[float | None] = (),
     locks: Callable[[Path], str] = no_locks,
 ) -> DryRun:
     """Compute the plan of a configuration without devices.
@@ -190,8 +190,8 @@ def dry_run(
     Args:
         runs: where the file would be, for the free disk space; default: the configured folder.
         remaining: function that returns the part of the plan that must still be taken.
-        whole: energies (keV), or numbers of states, whose scans in the series are already complete; at least one scan
-            must be left.
+        complete: energies (keV), or numbers of states, whose scans in the series are already complete; at least one
+            scan must be left.
         locks: function that returns what is wrong with the file locks in a folder, such as `no_locks`, which writes to
             the folder.
 
@@ -199,20 +199,22 @@ def dry_run(
         ConfigError: angles, scene or device settings are impossible. Exceeded limits do not raise an error here; they
             are listed as violations of the timeline.
     """
-    each = [one for one in each_scan(settings) if (one.scan.state or one.scan.energy) not in whole]
-    if settings.scan.energies is not None and len(each) > 1:  # a scene is read at both ends of the energy range
-        connect.describe(max(each, key=lambda one: one.scan.energy or 0.0))
-    stage, camera, to_counts = connect.describe(min(each, key=lambda one: one.scan.energy or 0.0))
-    there = disk_of(runs or Path(settings.storage.folder))
-    free = shutil.disk_usage(there).free
-    plans = [remaining(plan_of(one)) for one in each]
-    timelines = [worked_with(one, plan, stage, to_counts, camera, free) for one, plan in zip(each, plans, strict=True)]
-    worked = [
-        DryRun(plan, timeline, stage, camera, free, _needs(one, timeline), there)
-        for one, plan, timeline in zip(each, plans, timelines, strict=True)
+    configs = [config for config in each_scan(settings) if (config.scan.state or config.scan.energy) not in complete]
+    if settings.scan.energies is not None and len(configs) > 1:  # a scene is read at both ends of the energy range
+        connect.describe(max(configs, key=lambda config: config.scan.energy or 0.0))
+    stage, camera, to_counts = connect.describe(min(configs, key=lambda config: config.scan.energy or 0.0))
+    disk = disk_of(runs or Path(settings.storage.folder))
+    free = shutil.disk_usage(disk).free
+    plans = [remaining(plan_of(config)) for config in configs]
+    timelines = [
+        timeline_of(config, plan, stage, to_counts, camera, free) for config, plan in zip(configs, plans, strict=True)
     ]
-    worked_plan = _of_series(settings, each, worked) if settings.series else worked[0]
-    return replace(worked_plan, timeline=lockable(worked_plan.timeline, locks(there)))
+    dry_runs = [
+        DryRun(plan, timeline, stage, camera, free, _needs(config, timeline), disk)
+        for config, plan, timeline in zip(configs, plans, timelines, strict=True)
+    ]
+    planned = _of_series(settings, configs, dry_runs) if settings.series else dry_runs[0]
+    return replace(planned, timeline=with_lock_violation(planned.timeline, locks(disk)))
 
 
 def _copied(config: Config) -> frozenset[str]:
@@ -254,32 +256,35 @@ def _requests(config: Config, timeline: Timeline) -> Iterator[OperatorRequest]:
         yield OperatorRequest("decide what to measure next", max(len(timeline.views.trains), passes))
 
 
-def _of_series(settings: Config, configs: Sequence[Config], each: Sequence[DryRun]) -> DryRun:
+def _of_series(settings: Config, configs: Sequence[Config], dry_runs: Sequence[DryRun]) -> DryRun:
     """The first of several scans, with the needs and the violations of all of them."""
-    states, all_of_them = settings.scan.states, [one.needs for one in each]
-    total = replace(each[0], needs=all_needs(all_of_them))
+    states, needs_of_scans = settings.scan.states, [scan.needs for scan in dry_runs]
+    total = replace(dry_runs[0], needs=all_needs(needs_of_scans))
     if states is None:
-        sizes = ((one.timeline.duration, one.timeline.total_bytes) for one in each)
-        needs = [EnergyNeeds(one.scan.energy or 0.0, *of) for one, of in zip(configs, sizes, strict=True)]
+        sizes = ((scan.timeline.duration, scan.timeline.total_bytes) for scan in dry_runs)
+        needs = [EnergyNeeds(one.scan.energy or 0.0, *totals) for one, totals in zip(configs, sizes, strict=True)]
         total = replace(total, energies=tuple(needs))
     else:
         numbers = [config.scan.state or 0 for config in configs]
-        of_states = [StateNeeds(n, one.duration, one.total_bytes) for n, one in zip(numbers, all_of_them, strict=True)]
-        breaks = sum(max((states.every_s or 0.0) - one.duration, 0.0) for one in all_of_them[:-1])
+        state_needs = [
+            StateNeeds(n, one.duration, one.total_bytes) for n, one in zip(numbers, needs_of_scans, strict=True)
+        ]
+        breaks = sum(max((states.every_s or 0.0) - one.duration, 0.0) for one in needs_of_scans[:-1])
         parts = {**total.needs.parts, "wait": breaks}
-        total = replace(total, states=tuple(of_states), every=states.every_s, needs=replace(total.needs, parts=parts))
+        needs_with_waits = replace(total.needs, parts=parts)
+        total = replace(total, states=tuple(state_needs), state_interval=states.every_s, needs=needs_with_waits)
     what = "energies" if states is None else "states"
-    violations = dict.fromkeys(limit for one in each for limit in one.timeline.violations)
+    violations = dict.fromkeys(limit for scan in dry_runs for limit in scan.timeline.violations)
     if total.needs.total_bytes * ROOM > total.free_bytes:
         violations[
-            f"free some space, choose another storage.folder, or set fewer {what}: {len(each)} {what} need "
+            f"free some space, choose another storage.folder, or set fewer {what}: {len(dry_runs)} {what} need "
             f"{size(total.needs.total_bytes)} plus a reserve of a tenth, and the disk has {size(total.free_bytes)} "
             "free"
         ] = None
     return replace(total, timeline=replace(total.timeline, violations=tuple(violations)))
 
 
-def worked_with(
+def timeline_of(
     config: Config,
     plan: ScanPlan,
     stage: StageLimits,
@@ -289,26 +294,26 @@ def worked_with(
 ) -> Timeline:
     """The timeline, with a remark on the live volume."""
     axis_col, preview_bin, method = config.optics.axis_col, config.storage.preview_bin, config.recon.chosen_method
-    worked = work_out(plan, stage, to_counts, camera, axis_col=axis_col, preview_bin=preview_bin, free_bytes=free)
+    timeline = work_out(plan, stage, to_counts, camera, axis_col=axis_col, preview_bin=preview_bin, free_bytes=free)
     if not config.recon.live or not streams(method):
-        return worked
-    need = live_need(camera.shape, plan.n_views, free_memory())
-    return replace(worked, remarks=(*worked.remarks, need, *better_order(plan)))
+        return timeline
+    remark = live_need(camera.shape, plan.n_views, free_memory())
+    return replace(timeline, remarks=(*timeline.remarks, remark, *better_order(plan)))
 
 
-def lockable(worked: Timeline, no_locking: str) -> Timeline:
+def with_lock_violation(timeline: Timeline, no_locking: str) -> Timeline:
     """The plan, with an additional violation if files in its folder cannot be locked."""
-    return replace(worked, violations=(*worked.violations, no_locking)) if no_locking else worked
+    return replace(timeline, violations=(*timeline.violations, no_locking)) if no_locking else timeline
 
 
-def refuse_violations(worked: Timeline) -> None:
+def refuse_violations(timeline: Timeline) -> None:
     """Raise ConfigError with all violated limits, if there are any."""
-    broken = worked.violations
-    if len(broken) == 1:
-        first_limit = broken[0]
+    violations = timeline.violations
+    if len(violations) == 1:
+        first_limit = violations[0]
         raise ConfigError(f"a limit is exceeded, nothing was started: {first_limit}.")
-    if broken:
-        raise ConfigError("\n  ".join([f"{len(broken)} limits are exceeded, nothing was started:", *broken]))
+    if violations:
+        raise ConfigError("\n  ".join([f"{len(violations)} limits are exceeded, nothing was started:", *violations]))
 
 
 def disk_of(folder: Path) -> Path:
@@ -321,11 +326,11 @@ def disk_of(folder: Path) -> Path:
         raise ConfigError(
             f"choose another folder, because runs cannot be written to {folder}: {link} Nothing was started."
         )
-    there = next((place for place in (folder, *folder.parents) if place.exists()), None)
-    if there is None or not there.is_dir():
-        problem = "no such disk" if there is None else f"a file at {there}"
+    existing = next((place for place in (folder, *folder.parents) if place.exists()), None)
+    if existing is None or not existing.is_dir():
+        problem = "no such disk" if existing is None else f"a file at {existing}"
         raise ConfigError(
             f"choose another folder, because runs cannot be written to {folder}: there is {problem}. "
             "Nothing was started."
         )
-    return there
+    return existing

@@ -15,8 +15,8 @@ from beamline.plan.timeline import move_seconds, passes
 from beamline.scan.braking import Braking, FlownTrain
 from beamline.scan.control import State, StateMachine
 from beamline.scan.ledger import Ledger, Train, settle
-from beamline.scan.moves import arrive, go, stand
-from beamline.scan.tally import BlockTally, Exposed
+from beamline.scan.moves import move_and_wait, stop_and_wait, wait_for_move
+from beamline.scan.tally import BlockTally, ExposedFrame
 from beamline.scan.waits import Waits
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError
@@ -40,29 +40,31 @@ class FlyScan:
         self._stage, self._camera = devices.stage, devices.camera
         self._clock, self._stop, self._states, self._waits = clock, stop, states, waits
 
-    def frames(self, taken: BlockTally) -> Iterator[Exposed]:
+    def frames(self, tally: BlockTally) -> Iterator[ExposedFrame]:
         """Take the frames of a block, pass by pass, each with its trigger, its angle, and True."""
-        block, ahead, i = taken.block, passes(taken.block), 0
+        block, passes_of_block, trigger = tally.block, passes(tally.block), 0
         # A block begins within a pass only after a pause.
-        while (i := self._waits.after_pause(i, taken)) < block.n and not self._stop.stopping:
-            flown = next(flown for flown in ahead if i < flown.first + flown.train.n)
-            train, done = flown.train, i - flown.first
+        while (trigger := self._waits.after_pause(trigger, tally)) < block.n and not self._stop.stopping:
+            next_pass = next(
+                next_pass for next_pass in passes_of_block if trigger < next_pass.first + next_pass.train.n
+            )
+            train, n_done = next_pass.train, trigger - next_pass.first
             self._states.enter(State.TAXI)
-            begin = flown.start + float(block.angles[i] - block.angles[flown.first])
-            if not go(self._stage, begin, self._clock, self._stop):
+            begin = next_pass.start + float(block.angles[trigger] - block.angles[next_pass.first])
+            if not move_and_wait(self._stage, begin, self._clock, self._stop):
                 return
-            rest = TriggerTrain(train.start + done * train.interval, train.interval, train.n - done)
-            i += yield from self._pass(taken, rest, i, (begin, flown.end))
+            remaining = TriggerTrain(train.start + n_done * train.interval, train.interval, train.n - n_done)
+            trigger += yield from self._pass(tally, remaining, trigger, (begin, next_pass.end))
 
     def _pass(
-        self, taken: BlockTally, train: TriggerTrain, first: int, ends: tuple[float, float]
-    ) -> Generator[Exposed, None, int]:
+        self, tally: BlockTally, train: TriggerTrain, first: int, ends: tuple[float, float]
+    ) -> Generator[ExposedFrame, None, int]:
         """Make one pass over a train whose first trigger within the block is `first`. The stage is at the first of the
         ends.
 
         Returns the number of its triggers that are done: all, or those up to the last frame before a pause.
         """
-        block, (start, end) = taken.block, ends
+        block, (start, end) = tally.block, ends
         self._camera.arm(train.n)
         self._stage.arm(train)
         before = self._clock.now()
@@ -82,17 +84,17 @@ class FlyScan:
                 yield from flight.enter(last=True)
             cut_short = self._stop.stopping or flight.paused
         finally:
-            taken.enter(settle(flight.ledger, cut_short), first)
+            tally.enter(settle(flight.ledger, cut_short), first)
         self._stage.disarm()
         self._camera.disarm()
-        if flight.ledger.last < 0 and not cut_short and train.n >= SILENT_EXPOSURES:
+        if flight.ledger.last_trigger < 0 and not cut_short and train.n >= SILENT_EXPOSURES:
             raise InstrumentError(
                 "Check the trigger cable, its polarity and the stage's trigger output. "
                 f"{self._camera.name}: none of {train.n} triggers gave a frame while the stage turned "
                 f"from {math.degrees(start):.4g}° to {math.degrees(end):.4g}°. Earlier frames are in the "
                 "file."
             )
-        return flight.ledger.last + 1 if flight.paused else train.n
+        return flight.ledger.last_trigger + 1 if flight.paused else train.n
 
     def _expected(self, block: Block, angles: NDArray[np.float64], before: float, after: float) -> Train:
         """Expected times of the pulses, for a run-up with constant acceleration and then constant speed.
@@ -104,42 +106,42 @@ class FlyScan:
         first = (before + after) / 2 + block.taxi / block.speed + ramp
         return Train(angles, block.period, first, tolerance=(after - before) / 2 + RAMP_TOLERANCE * ramp)
 
-    def _until_standing(self, block: Block, flight: FlownTrain) -> Iterator[Exposed]:
+    def _until_standing(self, block: Block, flight: FlownTrain) -> Iterator[ExposedFrame]:
         """Yields frames while the stage turns. After a stop, it yields all frames until the stage has stopped.
 
         After a pause, it yields only the frames that were exposed before the stop was sent. These frames are the same
         as in a scan without a pause. The method waits for frames and not for the stage, so that a camera that sends no
         frames is noticed at once.
         """
-        tail = block.exposure + self._camera.timing.readout
-        patience = max(PATIENCE, PATIENCE_PERIODS * block.period) + tail
-        first_pulse = flight.ledger.train.first or 0.0
-        wait = patience + max(0.0, first_pulse - self._clock.now())
-        silent_at, stands = self._clock.now() + wait, False
+        frame_delay = block.exposure + self._camera.timing.readout
+        patience = max(PATIENCE, PATIENCE_PERIODS * block.period) + frame_delay
+        first_pulse = flight.ledger.train.first_time or 0.0
+        timeout = patience + max(0.0, first_pulse - self._clock.now())
+        silent_at, at_rest = self._clock.now() + timeout, False
         while not flight.so_far.complete:
-            if self._waits.interrupted and not stands:
+            if self._waits.interrupted and not at_rest:
                 self._brake(flight)
-                stands = True
-            frame = self._waits.next_frame(tail if stands else wait, until_stop=not stands)
+                at_rest = True
+            frame = self._waits.next_frame(frame_delay if at_rest else timeout, until_stop=not at_rest)
             if frame is not None:
-                wait, silent_at = patience, self._clock.now() + patience
-                if not flight.paused or frame.time + tail <= flight.stop_sent:
+                timeout, silent_at = patience, self._clock.now() + patience
+                if not flight.paused or frame.time + frame_delay <= flight.stop_sent:
                     yield from flight.enter(frame)
-            elif stands:
+            elif at_rest:
                 break
             elif self._clock.now() >= silent_at:  # the pause was requested earlier, and may have been withdrawn
                 if not self._stage.moving():
                     break
-                if self._clock.now() >= flight.last_due + tail:
+                if self._clock.now() >= flight.last_due + frame_delay:
                     break  # all triggers have come, and missing frames are reported with the rest of the pass
                 raise InstrumentError(
                     f"Check the trigger cable and the camera. {self._camera.name}: no frame for "
-                    f"{wait:.3g} s while the stage turned. Earlier frames are in the file."
+                    f"{timeout:.3g} s while the stage turned. Earlier frames are in the file."
                 )
         if flight.paused:
             return
-        if not stands:
-            arrive(self._stage, flight.seconds, self._clock, self._stop)
+        if not at_rest:
+            wait_for_move(self._stage, flight.seconds, self._clock, self._stop)
         while (frame := self._waits.next_frame(0.0, until_stop=False)) is not None:
             # all triggers have their frames, so the ledger counts further frames as extra
             yield from flight.enter(frame)
@@ -148,7 +150,7 @@ class FlyScan:
         """Stop the stage within a train, wait until it is at rest, and read its position."""
         train, limits = flight.train, self._stage.limits
         flight.stop_sent, flight.paused = self._clock.now(), not self._stop.stopping
-        stand(self._stage, self._clock, self._stop)
+        stop_and_wait(self._stage, self._clock, self._stop)
         if not flight.paused:
             position = (self._stage.to_counts(self._stage.position()) - train.start) / train.interval
             counts = limits.acceleration * limits.counts_per_turn / (2 * math.pi)

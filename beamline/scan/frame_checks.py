@@ -26,11 +26,11 @@ COMPILES = 300.0  # the same for the first frame of a kind, because checks may b
 STOPPED, ABORTED = 5.0, 1.0  # the same after a request to stop, and to abort
 SLICE = 0.25  # real s: longest wait for space in a queue, or for a frame, between two checks of the stop request
 
-Waiting = Frame | Callable[[], object] | None
+QueueItem = Frame | Callable[[], object] | None
 """Items of the queue: a frame, a function that is called when its turn comes, or None after the last frame."""
 Checked = tuple[Frame, FrameDigest, FrameDigest, tuple[Flag, ...] | None]
 """A frame, its digests for the checks and for the file, and its flags (None: the frame was not checked)."""
-Item = Checked | BaseException | Callable[[], object] | None
+CheckedItem = Checked | BaseException | Callable[[], object] | None
 """A checked item. An exception: the statistics of the frame could not be computed."""
 
 
@@ -38,7 +38,7 @@ class FrameChecks:
     """Takes items from a queue, and gives them on in the same order, each frame with its statistics and flags.
 
     Args:
-        following: function that waits for the next item.
+        next_item: function that waits for the next item.
         discards: function that returns True if frames are discarded, so that the queue does not stay full.
 
     Attributes:
@@ -46,19 +46,20 @@ class FrameChecks:
     """
 
     def __init__(
-        self, monitor: Monitor, preview_bin: int, following: Callable[[], Waiting], discards: Callable[[], bool],
+        self, monitor: Monitor, preview_bin: int, next_item: Callable[[], QueueItem], discards: Callable[[], bool],
         stop: StopRequest, sink: Sink,
     ) -> None:  # fmt: skip
         self._monitor, self._preview_bin = monitor, preview_bin
-        self._following, self._discards, self._stop, self._sink = following, discards, stop, sink
-        self._off = False  # the monitor
+        self._next_item, self._discards, self._stop, self._sink = next_item, discards, stop, sink
+        self._monitor_off = False
         self.busy = 0.0
-        self._checked: Queue[Item] = Queue(CHECKED_FRAMES)
+        self._checked: Queue[CheckedItem] = Queue(CHECKED_FRAMES)
         self._check_name = ""  # name of the check that is running, or ran last
-        self._handing = threading.Lock()  # protects the next two values, so that only one thread passes the frame on
+        # protects the next two values, so that only one thread passes the frame on
+        self._handing_over = threading.Lock()
         # the frame of this thread, and the time since which it has the frame
-        self._under_checks: tuple[Frame, float] | None = None
-        self._alone = False  # the thread that takes the frames continues without this one
+        self._frame_in_checks: tuple[Frame, float] | None = None
+        self._without_thread = False  # the thread that takes the frames continues without this one
         self._compiled: set[FrameKind] = set()  # kinds of frames that were checked so far
 
     def start(self) -> None:
@@ -74,16 +75,16 @@ class FrameChecks:
         """The thread: computes statistics and checks frames, until the last frame, or until the other thread continues
         alone.
         """
-        while (item := self._following()) is not None:
+        while (item := self._next_item()) is not None:
             if not isinstance(item, Frame):
                 self._checked.put(item)
             elif not self._discards():
-                self._under_checks = item, time.monotonic()
+                self._frame_in_checks = item, time.monotonic()
                 checked = self._digested(item)
-                with self._handing:
-                    if self._alone:
+                with self._handing_over:
+                    if self._without_thread:
                         return
-                    self._under_checks = None
+                    self._frame_in_checks = None
                 self._compiled.add(item.kind)
                 self._checked.put(checked)
         self._checked.put(None)
@@ -91,26 +92,26 @@ class FrameChecks:
     def _begin_check(self, name: str) -> None:
         self._check_name = name
 
-    def _digested(self, frame: Frame) -> Item:
+    def _digested(self, frame: Frame) -> CheckedItem:
         """A frame with its statistics and flags. If there was an error, the error is returned, and raised when the
         frame should be written.
         """
         begun = time.monotonic()
         try:
-            seen, stored = digests(frame.counts, self._monitor.context.saturation, self._preview_bin)
-            return frame, seen, stored, self._look(_as_stored(frame), seen)
+            frame_digest, stored_digest = digests(frame.counts, self._monitor.context.saturation, self._preview_bin)
+            return frame, frame_digest, stored_digest, self._flags_of(_as_stored(frame), frame_digest)
         except BaseException as error:
             return error
         finally:
             self.busy += time.monotonic() - begun
 
-    def next(self) -> Item:
+    def next(self) -> CheckedItem:
         """The next checked item. If the checks hang, the thread that calls computes the statistics itself."""
         while True:
             with suppress(Empty):
-                return self._checked.get(not self._alone, SLICE)
-            if self._alone:
-                item = self._following()
+                return self._checked.get(not self._without_thread, SLICE)
+            if self._without_thread:
+                item = self._next_item()
                 return self._digested(item) if isinstance(item, Frame) else item
             self._give_up_checks_that_hang()
 
@@ -118,15 +119,15 @@ class FrameChecks:
         """Switch the monitor off because it takes too long, and continue with its frame. The thread of the checks
         may hang for ever.
         """
-        with self._handing:
-            if self._under_checks is None:
+        with self._handing_over:
+            if self._frame_in_checks is None:
                 return
-            frame, since = self._under_checks
+            frame, since = self._frame_in_checks
             usual = CHECKS if frame.kind in self._compiled else COMPILES
             limit = ABORTED if self._stop.aborting else STOPPED if self._stop.stopping else usual
             if (seconds := time.monotonic() - since) <= limit:
                 return
-            self._off = self._alone = True
+            self._monitor_off = self._without_thread = True
         self._sink(
             Warned(
                 f"The monitor is off: its check {self._check_name} has not finished frame {frame.index} "
@@ -135,16 +136,16 @@ class FrameChecks:
         )
         self._checked.put(self._digested(frame))
 
-    def _look(self, frame: Frame, seen: FrameDigest) -> tuple[Flag, ...] | None:
+    def _flags_of(self, frame: Frame, frame_digest: FrameDigest) -> tuple[Flag, ...] | None:
         """The flags of the monitor; None if the monitor is off. An error does not lose a frame: a check that raises an
         error is switched off, with a warning.
         """
-        if self._off:
+        if self._monitor_off:
             return None
         try:
-            self._monitor, flags, failures = look_past_failures(self._monitor, frame, seen, self._begin_check)
+            self._monitor, flags, failures = look_past_failures(self._monitor, frame, frame_digest, self._begin_check)
         except BaseException as error:
-            self._off = True
+            self._monitor_off = True
             self._sink(Warned(f"the monitor failed at frame {frame.index} and is off: {error!r}"))
             return None
         for failure in failures:

@@ -49,8 +49,8 @@ class Train:
 
     angles: NDArray[np.float64]  # float64 [trigger] radians
     period: float  # s between triggers
-    first: float | None = None  # time of trigger 0, s since the Unix epoch; None if unknown
-    tolerance: float = 0.0  # largest error of `first` in s
+    first_time: float | None = None  # time of trigger 0, s since the Unix epoch; None if unknown
+    tolerance: float = 0.0  # largest error of `first_time` in s
 
     def __post_init__(self) -> None:
         if self.angles.ndim != 1 or self.angles.size == 0:
@@ -81,33 +81,35 @@ class Ledger:
     """
 
     train: Train  # the expected triggers
-    last: int = -1  # the trigger of the last matched frame, -1 before the first
-    exposed: int = -1  # framestamp of the last frame, whether it was matched or not; -1 before the first frame
+    last_trigger: int = -1  # the trigger of the last matched frame, -1 before the first
+    last_framestamp: int = -1  # framestamp of the last frame, whether it was matched or not; -1 before the first frame
     unmatched: int = 0  # number of exposures since the last matched frame, whether they were delivered or not
     # phase, period: estimated time of the last matched trigger, and estimated period, both in s
     phase: float = math.nan
     period: float = math.nan
-    # first: framestamp and trigger of the first matched frame, and its periods since the expected time of trigger 0
-    first: tuple[int, int, float] = (-1, -1, math.nan)
-    missing: tuple[int, ...] = ()  # triggers without a frame, ascending: those up to `last`; in a closed ledger, all
+    # first_match: framestamp and trigger of the first matched frame, and its periods since the expected time of
+    # trigger 0
+    first_match: tuple[int, int, float] = (-1, -1, math.nan)
+    # triggers without a frame, ascending: those up to `last_trigger`; in a closed ledger, all
+    missing: tuple[int, ...] = ()
     lost: int = 0  # number of these that were exposed but never delivered (gap in the framestamps)
     # number of these that were not exposed (gap in the times). Triggers after the last frame may be either
     ignored: int = 0
     extra: tuple[int, ...] = ()  # framestamps of frames that no trigger exposed
-    beyond: int = 0  # number of these that came at the time of a trigger after the last one
+    beyond_last: int = 0  # number of these that came at the time of a trigger after the last one
     unconfirmed: int = 0  # number of extra frames that were exposed while the stage braked
-    # off: largest distance of a matched frame from the expected time of its trigger, in periods. The angle of a frame
-    # may be wrong by this many steps
-    off: float = 0.0
-    # shift: in a closed ledger, the number of triggers by which all angles may be wrong. The reason: triggers that seem
-    # to be missing at one end may be missing at the other end, and an extra frame at the end may belong to the
-    # beginning. 0 if there are no such frames, or if the time of the first trigger is known
-    shift: int = 0
+    # largest_residual: largest distance of a matched frame from the expected time of its trigger, in periods. The angle
+    # of a frame may be wrong by this many steps
+    largest_residual: float = 0.0
+    # possible_shift: in a closed ledger, the number of triggers by which all angles may be wrong. The reason: triggers
+    # that seem to be missing at one end may be missing at the other end, and an extra frame at the end may belong to
+    # the beginning. 0 if there are no such frames, or if the time of the first trigger is known
+    possible_shift: int = 0
 
     @property
     def complete(self) -> bool:
         """True if the last trigger has its frame, so that no more frames are expected."""
-        return self.last == self.train.n - 1
+        return self.last_trigger == self.train.n - 1
 
 
 @dataclass(frozen=True)
@@ -126,25 +128,25 @@ def enter(ledger: Ledger, frames: Sequence[DeliveredFrame], last: bool) -> tuple
     Args:
         frames: waiting frames in the order in which they were exposed. last: True if there will be no further frames.
     """
-    first, *others = frames
-    ahead = [frame for frame in others if not math.isnan(frame.time)]
-    last = last or len(ahead) < len(others)  # frames without a known time do not help
+    first, *following = frames
+    following_timed = [frame for frame in following if not math.isnan(frame.time)]
+    last = last or len(following_timed) < len(following)  # frames without a known time do not help
     after, entry = assign(ledger, first.framestamp, first.time, first.steady)
     if math.isnan(first.time):
         return after, entry
-    if ledger.last < 0 and not start_known(ledger.train):
-        regular = _regular([frame.time for frame in (first, *ahead)], ledger.train.period)
-        if len(regular) < min(TRAIN, ledger.train.n) and len(frames) < LOOK and not last:
+    if ledger.last_trigger < 0 and not start_known(ledger.train):
+        regular_frames = _regular([frame.time for frame in (first, *following_timed)], ledger.train.period)
+        if len(regular_frames) < min(TRAIN, ledger.train.n) and len(frames) < LOOK and not last:
             return None
-        return (after, entry) if regular[0] == 0 else _extra(ledger, first, 0.0)
-    if entry.trigger == EXTRA or (off := _off(ledger, entry.trigger, first.time)) >= -NEAR:
+        return (after, entry) if regular_frames[0] == 0 else _extra(ledger, first, 0.0)
+    if entry.trigger == EXTRA or (periods_late := _periods_late(ledger, entry.trigger, first.time)) >= -NEAR:
         return after, entry
-    if not ahead and not last:
+    if not following_timed and not last:
         return None
-    for other in ahead:
-        if assign(ledger, other.framestamp, other.time, other.steady)[1].trigger == entry.trigger:
-            nearer = abs(_off(ledger, entry.trigger, other.time)) < -off
-            return _extra(ledger, first, entry.trigger + off) if nearer else (after, entry)
+    for later_frame in following_timed:
+        if assign(ledger, later_frame.framestamp, later_frame.time, later_frame.steady)[1].trigger == entry.trigger:
+            nearer = abs(_periods_late(ledger, entry.trigger, later_frame.time)) < -periods_late
+            return _extra(ledger, first, entry.trigger + periods_late) if nearer else (after, entry)
     return after, entry
 
 
@@ -160,32 +162,32 @@ def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) ->
     """
     train, frame = ledger.train, DeliveredFrame(framestamp, time, steady)
     if math.isnan(time):
-        return _extra(ledger, frame, max(ledger.last, 0))
-    new_exposures = framestamp - ledger.exposed
+        return _extra(ledger, frame, max(ledger.last_trigger, 0))
+    new_exposures = framestamp - ledger.last_framestamp
     exposures = ledger.unmatched + new_exposures
-    if ledger.last < 0:
-        position, trigger, residual = _first_place(train, exposures - 1, time)
+    if ledger.last_trigger < 0:
+        position, trigger, residual = _first_position(train, exposures - 1, time)
         steps = trigger + 1
     else:
-        position = ledger.last + (time - ledger.phase) / ledger.period
+        position = ledger.last_trigger + (time - ledger.phase) / ledger.period
         trigger = round(position)
-        steps, residual = trigger - ledger.last, position - trigger
+        steps, residual = trigger - ledger.last_trigger, position - trigger
     fits = abs(residual) <= (FREE if steady else CONFIRMED)
     if new_exposures < 1 or steps < 1 or trigger >= train.n or not fits:
         return _extra(ledger, frame, position, beyond=trigger >= train.n and fits)
     lost = min(exposures, steps) - 1
     matched = replace(
         ledger,
-        last=trigger,
-        exposed=framestamp,
+        last_trigger=trigger,
+        last_framestamp=framestamp,
         unmatched=0,
-        missing=(*ledger.missing, *range(ledger.last + 1, trigger)),
+        missing=(*ledger.missing, *range(ledger.last_trigger + 1, trigger)),
         lost=ledger.lost + lost,
         ignored=ledger.ignored + steps - 1 - lost,
-        off=max(ledger.off, abs(residual)),
+        largest_residual=max(ledger.largest_residual, abs(residual)),
     )
-    if ledger.last < 0:
-        matched = replace(matched, phase=time, period=train.period, first=(exposures - 1, trigger, position))
+    if ledger.last_trigger < 0:
+        matched = replace(matched, phase=time, period=train.period, first_match=(exposures - 1, trigger, position))
     elif steady:
         matched = _follow(ledger, matched, time, steps, residual)
     else:
@@ -195,14 +197,14 @@ def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) ->
 
 def _extra(ledger: Ledger, frame: DeliveredFrame, position: float, beyond: bool = False) -> tuple[Ledger, LedgerEntry]:
     """Enter a frame that no trigger exposed, at a position in periods."""
-    train, new_exposures = ledger.train, frame.framestamp - ledger.exposed
+    train, new_exposures = ledger.train, frame.framestamp - ledger.last_framestamp
     after = replace(
         ledger,
-        exposed=max(frame.framestamp, ledger.exposed),
+        last_framestamp=max(frame.framestamp, ledger.last_framestamp),
         # An extra frame is known, so it does not count among the exposures between two triggers.
         unmatched=ledger.unmatched + max(new_exposures - 1, 0),
         extra=(*ledger.extra, frame.framestamp),
-        beyond=ledger.beyond + beyond,
+        beyond_last=ledger.beyond_last + beyond,
         unconfirmed=ledger.unconfirmed + (not frame.steady),
     )
     return after, LedgerEntry(EXTRA, float(np.interp(position, np.arange(train.n), train.angles)))
@@ -215,43 +217,43 @@ def settle(ledger: Ledger, cut_short: bool = False) -> Ledger:
         cut_short: True if the scan was stopped. The scan did not wait for triggers after the last frame, so they do not
             count as missing.
     """
-    at_the_end = range(0 if cut_short else ledger.last + 1, 0 if cut_short else ledger.train.n)
-    shift = _shift(ledger, None if cut_short else len(at_the_end))
-    return replace(ledger, missing=(*ledger.missing, *at_the_end), shift=shift)
+    missing_at_end = range(0 if cut_short else ledger.last_trigger + 1, 0 if cut_short else ledger.train.n)
+    shift = _largest_shift(ledger, None if cut_short else len(missing_at_end))
+    return replace(ledger, missing=(*ledger.missing, *missing_at_end), possible_shift=shift)
 
 
 def start_known(train: Train) -> bool:
-    return train.n == 1 or (train.first is not None and train.tolerance <= KNOWN * train.period)
+    return train.n == 1 or (train.first_time is not None and train.tolerance <= KNOWN * train.period)
 
 
-def _off(ledger: Ledger, trigger: int, time: float) -> float:
+def _periods_late(ledger: Ledger, trigger: int, time: float) -> float:
     """Periods from the expected time of a frame's trigger to the frame; negative if the frame came earlier."""
-    if ledger.last >= 0:
-        return (time - ledger.phase) / ledger.period - (trigger - ledger.last)
-    return 0.0 if ledger.train.first is None else (time - ledger.train.first) / ledger.train.period - trigger
+    if ledger.last_trigger >= 0:
+        return (time - ledger.phase) / ledger.period - (trigger - ledger.last_trigger)
+    return 0.0 if ledger.train.first_time is None else (time - ledger.train.first_time) / ledger.train.period - trigger
 
 
 def _regular(times: Sequence[float], period: float) -> tuple[int, ...]:
     """The first frames that belong to a train of triggers: the frames that are most regularly spaced, whole periods
     apart."""
     # the best train that ends with each frame, and a measure of its quality
-    best: list[tuple[float, tuple[int, ...]]] = []
+    best_trains: list[tuple[float, tuple[int, ...]]] = []
     for i, time in enumerate(times):
         trains: list[tuple[float, tuple[int, ...]]] = [(0.0, (i,))]
-        for good, chain in best:
-            steps = (time - times[chain[-1]]) / period
+        for quality, frames in best_trains:
+            steps = (time - times[frames[-1]]) / period
             if round(steps) >= 1:
-                trains.append((good + 1 - ((steps - round(steps)) / UNEVEN) ** 2, (*chain, i)))
-        best.append(max(trains, key=lambda train: train[0]))
-    return max(best, key=lambda train: train[0])[1]
+                trains.append((quality + 1 - ((steps - round(steps)) / UNEVEN) ** 2, (*frames, i)))
+        best_trains.append(max(trains, key=lambda train: train[0]))
+    return max(best_trains, key=lambda train: train[0])[1]
 
 
 def _window(train: Train) -> float:
     """Largest difference of the first frame from its expected time, in periods."""
-    return math.inf if train.first is None else max(0.5, train.tolerance / train.period)
+    return math.inf if train.first_time is None else max(0.5, train.tolerance / train.period)
 
 
-def _first_place(train: Train, framestamp: int, time: float) -> tuple[float, int, float]:
+def _first_position(train: Train, framestamp: int, time: float) -> tuple[float, int, float]:
     """Position in periods, trigger, and distance between the two, of the first frame.
 
     Args:
@@ -260,28 +262,28 @@ def _first_place(train: Train, framestamp: int, time: float) -> tuple[float, int
     If the expected time is not precise enough, framestamps decide. The camera ignored no trigger before the first
     frame, because an armed, idle camera accepts every trigger.
     """
-    if train.first is None:
+    if train.first_time is None:
         return float(framestamp), framestamp, 0.0
-    position = (time - train.first) / train.period
+    position = (time - train.first_time) / train.period
     trigger = framestamp if abs(position - framestamp) <= _window(train) else round(position)
     # Only the distance beyond the uncertainty of the expected time counts.
     return position, trigger, max(0.0, abs(position - trigger) - train.tolerance / train.period)
 
 
-def _shift(ledger: Ledger, at_the_end: int | None) -> int:
+def _largest_shift(ledger: Ledger, missing_at_end: int | None) -> int:
     """The largest shift of all angles that the time of the first frame allows.
 
     Args:
-        at_the_end: number of triggers without a frame at the end. None: it is not known, and the number that the time
-            of the first frame suggests is used.
+        missing_at_end: number of triggers without a frame at the end. None: it is not known, and the number that the
+            time of the first frame suggests is used.
     """
-    if ledger.last < 0:
+    if ledger.last_trigger < 0:
         return 0
-    framestamp, trigger, position = ledger.first
+    framestamp, trigger, position = ledger.first_match
     window = _window(ledger.train)
-    if at_the_end is None:
-        at_the_end = max(0, round(position - trigger))
-    shifts = range(framestamp - trigger - ledger.beyond, at_the_end + 1)
+    if missing_at_end is None:
+        missing_at_end = max(0, round(position - trigger))
+    shifts = range(framestamp - trigger - ledger.beyond_last, missing_at_end + 1)
     if math.isinf(window):
         return max((abs(j) for j in shifts), default=0)
     return max((abs(j) for j in shifts if abs(position - trigger - j) <= window), default=0)

@@ -23,12 +23,12 @@ class LivePlan:
     """The part of a scan that its live volume uses."""
 
     binning: int = 1  # binning of rows and columns
-    every: int = 1  # one projection in N is used, in the order of acquisition
+    one_in: int = 1  # one projection in N is used, in the order of acquisition
     bytes: int = 0  # approximate memory in bytes
 
     @property
     def whole(self) -> bool:
-        return self.binning == self.every == 1
+        return self.binning == self.one_in == 1
 
 
 def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
@@ -45,13 +45,13 @@ def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
     while shape[1] > _WIDEST * binning:
         binning *= 2
     while True:
-        volume = live_bytes(shape, 0, binning)
-        view, room = live_bytes(shape, 1, binning) - volume, _SHARE * free - volume
-        most = max(1, int(room // view)) if room > 0 else 1
-        every = math.ceil(n_views / most)
-        used = math.ceil(n_views / every)
-        if used >= min(n_views, _FEWEST) or shape[1] // binning < 32:
-            return LivePlan(binning, every, volume + used * view)
+        volume_bytes = live_bytes(shape, 0, binning)
+        view_bytes, free_for_views = live_bytes(shape, 1, binning) - volume_bytes, _SHARE * free - volume_bytes
+        most_views = max(1, int(free_for_views // view_bytes)) if free_for_views > 0 else 1
+        one_in = math.ceil(n_views / most_views)
+        n_used = math.ceil(n_views / one_in)
+        if n_used >= min(n_views, _FEWEST) or shape[1] // binning < 32:
+            return LivePlan(binning, one_in, volume_bytes + n_used * view_bytes)
         binning *= 2
 
 
@@ -63,15 +63,15 @@ def better_order(plan: ScanPlan) -> tuple[str, ...]:
     if not one_way(angles) or angles.size < _FEWEST:
         return ()
     if plan.mode is Mode.STEP:
-        other, expected = "{scheme: golden}", _GOLDEN
+        better_angles, expected = "{scheme: golden}", _GOLDEN
     elif passes := next((n for n in _PASSES if angles.size % n == 0), 0):
-        other, expected = f"{{scheme: interlaced, passes: {passes}}}", _INTERLACED
+        better_angles, expected = f"{{scheme: interlaced, passes: {passes}}}", _INTERLACED
     else:
         return ()
     return (
         "with angles in sequence the live volume is a limited-angle reconstruction until the last projection. In a "
         f"test scan of particles its PSNR was {_SEQUENTIAL} dB after a quarter, half and three quarters of the scan. "
-        f"With scan.angles {other} the PSNR was {expected} dB; the final volume is the same",
+        f"With scan.angles {better_angles} the PSNR was {expected} dB; the final volume is the same",
     )
 
 
@@ -85,14 +85,14 @@ def live_need(shape: tuple[int, int], n_views: int, free: int) -> str:
     """A sentence about the live volume: its projections and pixels, its memory, and the reason for its size."""
     plan = live_plan(shape, n_views, free)
     rows, cols = (max(1, n // plan.binning) for n in shape)
-    views, most = math.ceil(n_views / plan.every), f"half of the {size(free)} of free memory"
+    views, most = math.ceil(n_views / plan.one_in), f"half of the {size(free)} of free memory"
     need = (
         f"the live volume uses {count(views, 'projection')} of {rows} x {cols} pixels and about "
         f"{size(plan.bytes)} of memory"
     )
     if plan.whole:
         return f"{need}; at most {most} is allowed"
-    how = [f"one projection in {plan.every}"] if plan.every > 1 else []
+    how = [f"one projection in {plan.one_in}"] if plan.one_in > 1 else []
     how += [f"pixels binned {plan.binning} x {plan.binning}"] if plan.binning > 1 else []
     whole = f"all {n_views} projections of {shape[0]} x {shape[1]} would need {size(live_bytes(shape, n_views))}"
     wide = f"at most {_WIDEST} columns and " if shape[1] > _WIDEST else ""

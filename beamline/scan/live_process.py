@@ -58,15 +58,15 @@ def follow_command(config: Config, plan: LivePlan | None = None, earlier: Sequen
         options["--seconds"] = config.recon.seconds
     if plan.binning > 1:
         options["--bin"] = plan.binning
-    if plan.every > 1:
-        options["--views"] = f"every:{plan.every}"
+    if plan.one_in > 1:
+        options["--views"] = f"every:{plan.one_in}"
     flags = ["--follow", *(word for part in earlier for word in ("--previous-part", str(part)))]
-    return lambda scan, output: _words(scan, flags, {**options, "-o": output})
+    return lambda scan, output: _recon_command(scan, flags, {**options, "-o": output})
 
 
 def finished_command(config: Config) -> LiveCommand:
     """The command `beamline recon SCAN` for the complete scan, for a method that needs all projections."""
-    return lambda scan, output: _words(scan, [], {**_common(config), "-o": output})
+    return lambda scan, output: _recon_command(scan, [], {**_common(config), "-o": output})
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,8 @@ def commands_of(config: Config, series: ResumableRun | None = None) -> Commands:
     if not config.recon.live:
         return Commands()
     if draws and (series is None or series.end_references is None):
-        how = Commands(_followed(config, series), finished_command(config), draws=True)
-        return replace(how, remark="Pictures are drawn during the scan; the volume is made after the scan.")
+        commands = Commands(_followed(config, series), finished_command(config), draws=True)
+        return replace(commands, remark="Pictures are drawn during the scan; the volume is made after the scan.")
     if not streams(method):
         remark = f"{method} needs the complete scan, so the reconstruction starts after the scan."
         return Commands(afterwards=finished_command(config), remark=remark)
@@ -117,9 +117,19 @@ def _common(config: Config) -> dict[str, object]:
     return {"--method": recon.chosen_method, "--axis": axis, "--seed": recon.seed, **of_reference}
 
 
-def _words(scan: Path, flags: Sequence[str], options: Mapping[str, object]) -> Sequence[str]:
-    words = [word for name, value in options.items() for word in (name, str(value))]
-    return [sys.executable, "-m", "beamline.cli.main", "recon", str(scan), *flags, "--beside-scan", "--json", *words]
+def _recon_command(scan: Path, flags: Sequence[str], options: Mapping[str, object]) -> Sequence[str]:
+    option_words = [word for name, value in options.items() for word in (name, str(value))]
+    return [
+        sys.executable,
+        "-m",
+        "beamline.cli.main",
+        "recon",
+        str(scan),
+        *flags,
+        "--beside-scan",
+        "--json",
+        *option_words,
+    ]
 
 
 def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
@@ -128,8 +138,8 @@ def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
     It should end after a new stop, ASK_LIVE_AFTER after the stop of the scan, or if the file is `useless`: damaged or
     without projections.
     """
-    last = ASK_LIVE_AFTER if stop.stopping else 0.0
-    return lambda: useless or (stop.stopping and stop.seconds >= last)
+    earliest = ASK_LIVE_AFTER if stop.stopping else 0.0
+    return lambda: useless or (stop.stopping and stop.seconds >= earliest)
 
 
 def abort_watch(stop: StopRequest, say: Callable[[str], None]) -> Callable[[], bool]:
@@ -139,14 +149,14 @@ def abort_watch(stop: StopRequest, say: Callable[[str], None]) -> Callable[[], b
     For a stopped scan, the function reports the duration of the wait, at its first call and then every 5 s.
     """
     # waiting time for the volume, see `live_should_end`
-    asked_at = max(stop.seconds, ASK_LIVE_AFTER) if stop.stopping else 0.0
-    due, most = 0.0, asked_at + _GRACE
+    requested_after = max(stop.seconds, ASK_LIVE_AFTER) if stop.stopping else 0.0
+    due, longest_wait = 0.0, requested_after + _GRACE
 
     def aborting() -> bool:
         nonlocal due
         if stop.stopping and not stop.aborting and stop.seconds >= due:
             due = stop.seconds + _SAY_EVERY
-            waited = f"{stop.seconds:.0f} of at most {most:.0f} s"
+            waited = f"{stop.seconds:.0f} of at most {longest_wait:.0f} s"
             say(
                 f"Waiting for the live volume from the projections taken so far ({waited}). Press Ctrl-C to finish "
                 "without a live volume"
@@ -193,7 +203,7 @@ class LiveReconstruction:
         self._wanted = True  # no other code has asked it to end
         self._ready, self._shown = threading.Event(), threading.Event()
         self._process: ChildProcess | None = None
-        self._command, self._low_priority, self._again, self._child = command, low_priority, _AGAIN, child
+        self._command, self._low_priority, self._restarts_left, self._child = command, low_priority, _AGAIN, child
         self._changing = threading.Lock()  # protects the process, and the request for another one
         with self._changing:
             self._start("a" if self._log.exists() else "x")
@@ -285,8 +295,8 @@ class LiveReconstruction:
             while process.code is None and time.monotonic() - since < _CLOSE:  # the output ends before the process does
                 time.sleep(_POLL)
             when = "during the scan" if self._ready.is_set() else "before it was ready"
-            if killed := process.code is not None and process.code < 0 and self._again > 0:
-                self._again -= 1
+            if killed := process.code is not None and process.code < 0 and self._restarts_left > 0:
+                self._restarts_left -= 1
                 then = (
                     "A new live reconstruction is started; it begins with the projections that are already in the file."
                 )

@@ -144,30 +144,30 @@ class Measurement:
             self._acquisition(recorder, beam, follower) if self.source_of is None else self.source_of(self)
         )
         labels = LabelLog()
-        ended = _Ending(self.sink)
-        with ended.kept(), beam:
+        ending = _Ending(self.sink)
+        with ending.kept(), beam:
             self._acquire(acquisition, recorder, labels, follower)
         self.states.enter(
             State.FINISHING, UNSAFE if acquisition.unsafe else SAFE if self.source_of is None else WRITTEN
         )
-        with ended.kept():
+        with ending.kept():
             recorder.finish()
         faults = self.references.faults(recorder.references)
         missing, closed = acquisition.missing, False
-        status, reason = ended.how
-        with ended.kept():
+        status, reason = ending.how
+        with ending.kept():
             if not recorder.hangs:  # a write that does not return holds the lock of HDF5, and closing would wait for it
                 writer.close(status, missing, beam.readings, reason)
                 closed = True
-        with ended.kept():
+        with ending.kept():
             if self.instrument.simulated is not None and not recorder.hangs:
                 write_labels(labels_path(writer.path), labels.runs(writer.committed), writer.committed)
         for remark in filter(None, (*writer.remarks, recorder.flagged.unchecked(writer.path))):
             self.sink(Warned(remark))
-        with ended.kept():
+        with ending.kept():
             release()
         path, n_frames = writer.path, writer.committed
-        with ended.kept():
+        with ending.kept():
             if self.series is not None and n_frames and closed:
                 path, n_frames = self.series.join(path)
         result = RunResult(
@@ -189,12 +189,12 @@ class Measurement:
         if follower is not None and draws:
             follower.end_shown(lambda: self.stop.aborting or not closed)
         elif follower is not None:
-            useless = not closed or isinstance(ended.error, ReferencesError)
+            useless = not closed or isinstance(ending.error, ReferencesError)
             aborting = abort_watch(self.stop, lambda text: self.sink(StateEntered(self.states.state, text)))
             recon = follower.finish(live_should_end(self.stop, useless), aborting)
             result = replace(result, recon=recon)
-        if ended.error is not None:
-            raise ended.error
+        if ending.error is not None:
+            raise ending.error
         return replace(result, seconds=time.monotonic() - self.began)
 
     def _acquire(
@@ -270,29 +270,35 @@ class Measurement:
         return _stopped_sentence(faults.values(), recorder.n_frames)
 
 
-def _decider_of(run: Measurement) -> Decider:
+def _decider_of(measurement: Measurement) -> Decider:
     """The decider of a scan, before its first frame."""
-    scan, timeline, devices = run.config.scan, run.ready.timeline, run.instrument.devices
+    scan, timeline, devices = measurement.config.scan, measurement.ready.timeline, measurement.instrument.devices
 
     def seconds_of(block: Block) -> float:
         return block_seconds(
-            block, devices.stage.limits, run.ready.timing, run.ready.plan.settle, devices.stage.position()
+            block,
+            devices.stage.limits,
+            measurement.ready.timing,
+            measurement.ready.plan.settle,
+            devices.stage.position(),
         )
 
-    after = timeline.blocks[timeline.blocks.index(timeline.views) :]
+    remaining_blocks = timeline.blocks[timeline.blocks.index(timeline.views) :]
     return Decider(
         asks=scan.decide == "ask",
         target=ScanTarget(**dict(scan.target)),
         wait=scan.wait_s,
         timeline=timeline,
         seconds_of=seconds_of,
-        now=run.instrument.clock.now,
-        states=run.states,
-        stop=run.stop,
-        sink=run.sink,
-        added_seconds=sum(seconds_of(block) for block in after if block.kind in REFERENCES and scan.decide != "off")
-        + (run.series.seconds if run.series else 0.0),
-        retaken=run.series.retaken if run.series else 0,
+        now=measurement.instrument.clock.now,
+        states=measurement.states,
+        stop=measurement.stop,
+        sink=measurement.sink,
+        added_seconds=sum(
+            seconds_of(block) for block in remaining_blocks if block.kind in REFERENCES and scan.decide != "off"
+        )
+        + (measurement.series.seconds if measurement.series else 0.0),
+        retaken=measurement.series.retaken if measurement.series else 0,
         number=len(timeline.plan.choices),
         close_shutter=lambda: None if devices.shutter.by_hand else devices.shutter.close(),
     )

@@ -13,7 +13,7 @@ from beamline.core.stop import ScanAborted, StopRequest
 from beamline.core.text import count, spans
 from beamline.plan.plan import Block
 from beamline.plan.timeline import move_seconds
-from beamline.scan.tally import ASTRAY_ADVICE
+from beamline.scan.tally import OFF_TARGET_ADVICE
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError
 from drivers.base.frame import FrameKind
@@ -29,22 +29,26 @@ UNSAFE = (
 POLL = 0.02  # s between status queries of a moving stage
 
 
-def go(stage: RotationStage, angle: float, clock: Clock, stop: StopRequest, *, until_stop: bool = True) -> bool:
+def move_and_wait(
+    stage: RotationStage, angle: float, clock: Clock, stop: StopRequest, *, until_stop: bool = True
+) -> bool:
     """Move to `angle` at full speed and wait. Returns False if a stop (or, on request, only an abort) interrupted the
     move."""
     limits = stage.limits
     distance = angle - stage.position()
     stage.start_move(angle, limits.max_speed)
-    return arrive(stage, move_seconds(distance, limits.max_speed, limits.acceleration), clock, stop, until_stop)
+    return wait_for_move(stage, move_seconds(distance, limits.max_speed, limits.acceleration), clock, stop, until_stop)
 
 
-def arrive(stage: RotationStage, seconds: float, clock: Clock, stop: StopRequest, until_stop: bool = True) -> bool:
+def wait_for_move(
+    stage: RotationStage, seconds: float, clock: Clock, stop: StopRequest, until_stop: bool = True
+) -> bool:
     """Wait for a move that should take `seconds`. Returns False if a stop ended it early."""
     deadline = clock.now() + 2 * seconds + 5.0
     while stage.moving():
         stop.refuse_abort()
         if until_stop and stop.stopping:
-            stand(stage, clock, stop)
+            stop_and_wait(stage, clock, stop)
             return False
         if clock.now() > deadline:
             break
@@ -53,7 +57,7 @@ def arrive(stage: RotationStage, seconds: float, clock: Clock, stop: StopRequest
     return True
 
 
-def stand(stage: RotationStage, clock: Clock, stop: StopRequest) -> None:
+def stop_and_wait(stage: RotationStage, clock: Clock, stop: StopRequest) -> None:
     """Decelerate and wait until the stage is at rest. Raises InstrumentError if it keeps moving."""
     limits = stage.limits
     deadline = clock.now() + 2 * limits.max_speed / limits.acceleration + 5.0
@@ -67,21 +71,21 @@ def stand(stage: RotationStage, clock: Clock, stop: StopRequest) -> None:
         clock.sleep(POLL)
 
 
-def looked_again(stage: RotationStage, angle: float, before: float) -> tuple[float, str]:
+def position_during_exposure(stage: RotationStage, angle: float, before: float) -> tuple[float, str]:
     """Position of the stage during the exposure of a frame that was planned at `angle`, and a sentence if the position
     is wrong.
 
     The frame exists, and the stage was at `before` (rad) when its exposure began.
     """
     moving, after = stage.moving(), stage.position()
-    wanted, most = stage.to_counts(angle), stage.limits.tolerance
-    if not moving and all(abs(stage.to_counts(place) - wanted) <= most for place in (before, after)):
+    target_counts, tolerance = stage.to_counts(angle), stage.limits.tolerance
+    if not moving and all(abs(stage.to_counts(position) - target_counts) <= tolerance for position in (before, after)):
         return (before + after) / 2, ""
     motion = "is moving " if moving else ""
     return after, (
         f"the frame was exposed while the stage was not at the planned angle of {math.degrees(angle):.4f}°, although "
         f"the stage had reported its arrival there. The stage was at {math.degrees(before):.4f}° before the exposure "
-        f"and {motion}at {math.degrees(after):.4f}° after it. {ASTRAY_ADVICE}"
+        f"and {motion}at {math.degrees(after):.4f}° after it. {OFF_TARGET_ADVICE}"
     )
 
 
@@ -106,7 +110,7 @@ def set_shutter_and_sample(devices: Devices, block: Block, warm_up: Callable[[],
         )
 
 
-def remembered_places(devices: Devices, kind: FrameKind, stop: StopRequest) -> dict[str, Callable[[], str]]:
+def position_checks_of(devices: Devices, kind: FrameKind, stop: StopRequest) -> dict[str, Callable[[], str]]:
     """For each device, by name, a function that tests whether the device is still in the position that this kind of
     frame needs."""
     shutter, remembered = devices.shutter, dict[str, Callable[[], str]]()
@@ -119,9 +123,11 @@ def remembered_places(devices: Devices, kind: FrameKind, stop: StopRequest) -> d
     return remembered
 
 
-def require_in_place(looks: dict[str, Callable[[], str]], kind: FrameKind, rows: range, stop: StopRequest) -> None:
+def require_in_place(
+    position_checks: dict[str, Callable[[], str]], kind: FrameKind, rows: range, stop: StopRequest
+) -> None:
     """Raise InstrumentError if a device has left the position that it had before a block."""
-    moved = {name: problem for name, look in looks.items() if (problem := look())}
+    moved = {name: problem for name, check in position_checks.items() if (problem := check())}
     if moved and rows and not stop.aborting:
         how_many = count(len(rows), kind.name.lower())
         row_numbers = spans(list(rows))
@@ -157,12 +163,12 @@ def make_safe(
     stage, camera, shutter = devices.stage, devices.camera, devices.shutter
     failed: list[BaseException] = []
 
-    def attempt(*ways: Callable[[], object]) -> bool:
+    def attempt(*actions: Callable[[], object]) -> bool:
         """Try the actions one after the other until one works. (A serial line that failed once often works again.)"""
         failures: list[BaseException] = []
-        for way in ways:
+        for action in actions:
             try:
-                way()
+                action()
             except ScanAborted:  # the stop was requested while the stage was moving here
                 return attempt(stage.abort, stage.abort)
             except BaseException as error:  # a failure of one device must not leave the others unsafe
@@ -174,16 +180,16 @@ def make_safe(
         failed.append(failures[0])
         return False
 
-    halts = (*[lambda: stand(stage, clock, stop)] * 2, stage.abort)
-    attempt(*((stage.abort, stage.abort) if stop.aborting else halts))
+    stop_actions = (*[lambda: stop_and_wait(stage, clock, stop)] * 2, stage.abort)
+    attempt(*((stage.abort, stage.abort) if stop.aborting else stop_actions))
     attempt(camera.disarm, camera.disarm)
     attempt(shutter.close, shutter.close)
     attempt(stage.disarm, stage.disarm)
     if home is None or failed or stop.aborting:
         return failed, bool(failed)
     attempt(devices.sample.back)
-    went_home = attempt(lambda: go(stage, home, clock, stop, until_stop=False))
-    return failed, not (went_home or attempt(*halts))
+    went_home = attempt(lambda: move_and_wait(stage, home, clock, stop, until_stop=False))
+    return failed, not (went_home or attempt(*stop_actions))
 
 
 def in_words(error: BaseException) -> str:

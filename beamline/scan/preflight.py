@@ -21,7 +21,7 @@ from beamline.monitor.digest import digests
 from beamline.monitor.watch import Monitor, usual_step
 from beamline.monitor.watch import start as start_monitor
 from beamline.plan.plan import Mode, ScanPlan, Timeline
-from beamline.scan.dry_run import Remaining, all_of, disk_of, lockable, refuse_violations, worked_with
+from beamline.scan.dry_run import Remaining, all_of, disk_of, refuse_violations, timeline_of, with_lock_violation
 from beamline.storage.writer_lock import no_locks
 from beamline.storage.writers.nxtomo import ScanInfo
 from drivers.base.protocols import CameraSettings, CameraTiming, TriggerSource
@@ -63,7 +63,9 @@ def preflight(
     settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.EXTERNAL))
     timing, disk = camera.timing, disk_of(runs)
     free = shutil.disk_usage(disk).free
-    timeline = lockable(worked_with(config, plan, stage.limits, stage.to_counts, timing, free), no_locks(disk))
+    timeline = with_lock_violation(
+        timeline_of(config, plan, stage.limits, stage.to_counts, timing, free), no_locks(disk)
+    )
     refuse_violations(timeline)
     ready = ready_scan(config, timeline, settings, timing, _info(config, instrument, plan, timeline), check_stop)
     if instrument.simulated is not None:
@@ -109,7 +111,7 @@ def _saturation(timing: CameraTiming) -> int:
 
 
 def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline: Timeline) -> ScanInfo:
-    asked = {
+    plan_values = {
         "scheme": plan.scheme,
         "mode": plan.mode,
         "exposure_s": plan.exposure,
@@ -122,18 +124,18 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
         "flats": {"count": plan.flats.count, "at": plan.flats.at, "exposure_s": plan.flats.exposure},
         "angles_deg": np.degrees(plan.angles).tolist(),
     }
-    known = scan_info(config, instrument)
+    device_values = scan_info(config, instrument)
     return replace(
-        known,
+        device_values,
         saturation=_saturation(instrument.devices.camera.timing),
         exposure=plan.exposure,
         period=timeline.views.period,
-        plan=json_of(asked),
+        plan=json_of(plan_values),
         offset_views=bool(plan.offset_places),
         decides=config.scan.decide != "off",
-        filter=plan.filter or known.filter,
-        energy_kev=plan.energy or known.energy_kev,
-        monochromator_kev=plan.energy or known.monochromator_kev,
+        filter=plan.filter or device_values.filter,
+        energy_kev=plan.energy or device_values.energy_kev,
+        monochromator_kev=plan.energy or device_values.monochromator_kev,
     )
 
 

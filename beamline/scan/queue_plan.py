@@ -103,11 +103,13 @@ class QueuePlan:
         if not can_run:
             return table
         parts = [(part, _hms(seconds)) for part, seconds in {**needs.parts, "all": needs.duration}.items()]
-        rest = f"at most {_hms(needs.volume_seconds)} for the live volumes, and " if needs.volume_seconds else ""
+        time_besides = (
+            f"at most {_hms(needs.volume_seconds)} for the live volumes, and " if needs.volume_seconds else ""
+        )
         sums = f"{size(needs.total_bytes)} of {size(self.free_bytes)} free, {hms_text(needs.duration)}"
         return [
             *table[:2], aligned([("part", "time (h:min:s)"), *parts]), "",
-            f"{table[2]}: {sums}, plus {rest}the time between them",
+            f"{table[2]}: {sums}, plus {time_besides}the time between them",
         ]  # fmt: skip
 
     def data(self) -> Mapping[str, Any]:
@@ -118,7 +120,7 @@ class QueuePlan:
 
     def refuse_impossible(self) -> None:
         """Raise ConfigError with the faults of all scans, if any scan has a fault. Nothing was started."""
-        of_scans = [_named(scan, fault) for scan in self.scans for fault in scan.faults]
+        of_scans = [_fault_line(scan, fault) for scan in self.scans for fault in scan.faults]
         if of_scans or self.faults:
             bad = count(sum(not scan.valid for scan in self.scans), "scan")
             what = f"{bad} of {len(self.scans)} cannot run" if of_scans else "the scans do not fit on the disk"
@@ -135,20 +137,20 @@ def queue_of(scans: Iterable[PlannedScan]) -> QueuePlan:
         if scan.disk is not None:
             folder, needed = disks.get(number := scan.disk.stat().st_dev, (scan.disk, 0))
             disks[number] = folder, needed + scan.needs.total_bytes
-    room = [(folder, needed, shutil.disk_usage(folder).free) for folder, needed in disks.values()]
+    disk_space = [(folder, needed, shutil.disk_usage(folder).free) for folder, needed in disks.values()]
     faults = [
         ScanFault(
             f"all scans that can run need {size(needed)} plus a reserve of a tenth on the disk of {folder}, which "
             f"has {size(free)} free. Free some space, or choose another storage.folder"
         )
-        for folder, needed, free in room
+        for folder, needed, free in disk_space
         if needed * ROOM > free
     ]
-    free_bytes = min((free for _, _, free in room), default=0)
+    free_bytes = min((free for _, _, free in disk_space), default=0)
     return QueuePlan(planned, tuple(faults), all_needs(scan.needs for scan in can_run), free_bytes)
 
 
-def _named(scan: PlannedScan, fault: ScanFault) -> str:
+def _fault_line(scan: PlannedScan, fault: ScanFault) -> str:
     """A line about a fault, with the name of its scan."""
     text, sample = str(fault), f" ({scan.sample})" if scan.sample else ""
     return text if text.startswith(scan.source) else f"{scan.source}{sample}: {text}"
@@ -159,8 +161,8 @@ def _cells(scan: PlannedScan) -> tuple[str, ...]:
     needs = scan.needs
     if not needs.parts:
         return ("-",) * 5
-    asked, dose = sum(times for _, times in needs.operator), needs.dose_gy
-    sums = (str(needs.n_frames), f"{needs.total_bytes / 1e6:.1f}", _hms(needs.duration), str(asked))
+    n_requests, dose = sum(times for _, times in needs.operator), needs.dose_gy
+    sums = (str(needs.n_frames), f"{needs.total_bytes / 1e6:.1f}", _hms(needs.duration), str(n_requests))
     return (*sums, "-" if dose is None else f"{dose:.4g}")
 
 

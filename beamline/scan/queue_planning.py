@@ -47,14 +47,14 @@ def plan_queue(
     """
     locks = cache(no_locks)  # only once per folder, because it takes time on a network disk
 
-    def planned(source: str, file: Path, own: Sequence[Override]) -> PlannedScan:
+    def planned(source: str, file: Path, own_overrides: Sequence[Override]) -> PlannedScan:
         try:
-            read = read_config(file, (*own, *overrides), rehearse=rehearse, no_live=no_live)
+            read = read_config(file, (*own_overrides, *overrides), rehearse=rehearse, no_live=no_live)
         except (ConfigError, DataError, OSError) as error:
             return PlannedScan(source, faults=_faults_of(error, str(file)))
         return plan_of_config(read.config, place, source, read, locks)
 
-    described = (scan for each in scans for scan in _described(each))
+    described = (scan for description in scans for scan in _described(description))
     return queue_of(scan if isinstance(scan, PlannedScan) else planned(*scan) for scan in described)
 
 
@@ -105,8 +105,8 @@ def _rows(table: Path) -> Iterator[_Described | PlannedScan]:
             )
             yield PlannedScan(place, faults=(ScanFault(fault, str(table), number),))
             continue
-        own = [(f"{key}={value}", place) for key, value in cells.items() if key != _CONFIG and value]
-        yield place, table.parent / cells[_CONFIG], own
+        overrides = [(f"{key}={value}", place) for key, value in cells.items() if key != _CONFIG and value]
+        yield place, table.parent / cells[_CONFIG], overrides
 
 
 def plan_of_config(
@@ -125,14 +125,14 @@ def plan_of_config(
     faults = [] if read is None else [_placed_at(place_of_value, sentence) for place_of_value, sentence in read.faults]
     planned = PlannedScan(source, config.sample.name, config=config)
     try:
-        unusual = doubts(config)
-        worked = dry_run(config, place, locks=locks)
+        doubtful = doubts(config)
+        planned_run = dry_run(config, place, locks=locks)
     except (ConfigError, DataError, OSError) as error:  # the faults of the values may have caused this error
-        return replace(planned, faults=tuple(faults or [_named_in(read, fault) for fault in _faults_of(error)]))
-    warnings = [warning for warning in unusual if all(warning not in fault.message for fault in faults)]
-    faults += [_named_in(read, ScanFault(sentence)) for sentence in worked.timeline.violations]
+        return replace(planned, faults=tuple(faults or [_placed_by_key(read, fault) for fault in _faults_of(error)]))
+    warnings = [warning for warning in doubtful if all(warning not in fault.message for fault in faults)]
+    faults += [_placed_by_key(read, ScanFault(sentence)) for sentence in planned_run.timeline.violations]
     planned = replace(planned, faults=tuple(faults), warnings=tuple(warnings))
-    return replace(planned, needs=worked.needs, disk=worked.disk, worked=worked)
+    return replace(planned, needs=planned_run.needs, disk=planned_run.disk, worked=planned_run)
 
 
 def _faults_of(error: Exception, file: str | None = None) -> tuple[ScanFault, ...]:
@@ -148,7 +148,7 @@ def _placed_at(place: str, sentence: str) -> ScanFault:
     return ScanFault(sentence, file, int(line)) if is_file else ScanFault(f"{place}: {sentence}")
 
 
-def _named_in(read: ReadConfig | None, fault: ScanFault) -> ScanFault:
+def _placed_by_key(read: ReadConfig | None, fault: ScanFault) -> ScanFault:
     """The fault with the place of the first key that its sentence names."""
     key = _KEY.search(fault.message)
     return fault if read is None or key is None else _placed_at(read.tree.origin((*key[0].split("."),)), fault.message)

@@ -27,7 +27,7 @@ from beamline.plan.plan import Timeline
 from beamline.scan import backlog
 from beamline.scan.backlog import DiskSpace, FrameProgress, hold_for_backlog, room
 from beamline.scan.flagged import FlaggedFrames
-from beamline.scan.frame_checks import SLICE, FrameChecks, Waiting
+from beamline.scan.frame_checks import SLICE, FrameChecks, QueueItem
 from beamline.scan.references import ReferenceLog
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
@@ -76,12 +76,12 @@ class Recorder:
         self.announced, self._retaking = 0, False
         self.references = ReferenceLog()
         self._failure: BaseException | None = None
-        self._writing = 0.0  # time in s for which the second thread was busy
-        self._most = room(timeline)
-        self._waiting: Queue[Waiting] = Queue(self._most)
+        self._write_seconds = 0.0  # time in s for which the second thread was busy
+        self._queue_limit = room(timeline)
+        self._waiting: Queue[QueueItem] = Queue(self._queue_limit)
         self._space = DiskSpace(self._pause, writer.path.parent, timeline)
         # True if the projections are a fly scan; True while the stage flies
-        self._flies, self._flying = bool(timeline.views.trains), False
+        self._is_fly_scan, self._flying = bool(timeline.views.trains), False
         self._writing_since = math.inf
         self._checks = FrameChecks(monitor, preview_bin, self._next, self._fails, self._stop, sink)
         self._thread = threading.Thread(target=self._write_frames, name="recorder", daemon=True)
@@ -140,7 +140,7 @@ class Recorder:
         """True if a frame is still being written. After `finish`, this means that the disk does not respond."""
         return self._thread.is_alive()
 
-    def _enqueue(self, item: Waiting) -> None:
+    def _enqueue(self, item: QueueItem) -> None:
         """Queue a frame, a function that is called when its turn comes, or None after the last frame."""
         while True:
             if self._stop.aborting or (self._stop.stopping and self._flying):
@@ -154,7 +154,7 @@ class Recorder:
 
     def _refuse_stall(self) -> None:
         if time.monotonic() - self._writing_since > STALL:
-            raise DataError(f"Check the disk, because it accepted no frame for {STALL:g} s. {self._safe()}")
+            raise DataError(f"Check the disk, because it accepted no frame for {STALL:g} s. {self._safe_sentence()}")
 
     def _raise_failure(self) -> None:
         cause = self._failure
@@ -162,12 +162,12 @@ class Recorder:
             raise cause
         if cause is not None:
             reason = user_message(cause).rstrip(".")
-            raise DataError(f"A frame could not be written: {reason}. {self._safe()}") from cause
+            raise DataError(f"A frame could not be written: {reason}. {self._safe_sentence()}") from cause
 
     def _fails(self) -> bool:
         return self._failure is not None
 
-    def _safe(self) -> str:
+    def _safe_sentence(self) -> str:
         return f"The first {self._writer.safe} frames are safe in {self._writer.path}."
 
     def _write_frames(self) -> None:
@@ -194,13 +194,13 @@ class Recorder:
                 with suppress(BaseException):  # the first error counts
                     self._writer.flush()  # the frames before it
                 self._failure = self._failure or error
-            self._writing += time.monotonic() - begun
+            self._write_seconds += time.monotonic() - begun
             self._writing_since = math.inf
             if item is None:
                 return
             item = self._checks.next()
 
-    def _next(self) -> Waiting:
+    def _next(self) -> QueueItem:
         """The next item of the queue. While it waits, it checks the disk about once a second."""
         while True:
             self._look_at_backlog()
@@ -209,23 +209,25 @@ class Recorder:
                 return self._waiting.get(timeout=backlog.LOOK)
 
     def _look_at_backlog(self) -> None:
-        if self._flies:
+        if self._is_fly_scan:
             hold_for_backlog(
-                self._pause, self._most,
+                self._pause, self._queue_limit,
                 self._waiting.qsize() if self._flying else 0,  # other frames wait in `put`
-                self._checks.busy, self._writing,
+                self._checks.busy, self._write_seconds,
             )  # fmt: skip
 
-    def _write(self, frame: Frame, seen: FrameDigest, stored: FrameDigest, flags: tuple[Flag, ...] | None) -> None:
-        self._writer.append(frame, stored, flags or ())
-        self.references.add(frame, seen)
+    def _write(
+        self, frame: Frame, frame_digest: FrameDigest, stored_digest: FrameDigest, flags: tuple[Flag, ...] | None
+    ) -> None:
+        self._writer.append(frame, stored_digest, flags or ())
+        self.references.add(frame, frame_digest)
         self.n_frames += 1
-        beside = frame.replaces >= 0 and frame.replaces not in self._invalid and not self._retaking
+        unplanned = frame.replaces >= 0 and frame.replaces not in self._invalid and not self._retaking
         if frame.kind is FrameKind.INVALID:
             self._invalid.add(frame.index)
-        if frame.kind is FrameKind.INVALID or beside:
+        if frame.kind is FrameKind.INVALID or unplanned:
             # frames that were neither planned nor announced
             self._progress.expect_more(self.n_frames - 1, 1, frame.exposure)
         self.flagged.add(frame, flags)
-        if (event := self._progress.update(frame, self.n_frames, seen.mean)) is not None:
+        if (event := self._progress.update(frame, self.n_frames, frame_digest.mean)) is not None:
             self._sink(event)

@@ -31,22 +31,22 @@ def first_state(config: Config, series: Path) -> Path | None:
     return scan_file(max(runs)) if runs else None
 
 
-def recorded_in(scan: Path, block: Block) -> Sequence[Frame]:
+def recorded_in(path: Path, block: Block) -> Sequence[Frame]:
     """Darks or flats of another scan for a block; empty if it does not have enough of them, or the block is of another
     kind."""
     if block.kind not in REFERENCES:
         return ()
-    with open_scan(scan) as source:
+    with open_scan(path) as source:
         rows = source.table.of_kind(block.kind)[: block.n]
         return [source.table.frame(row, source.read([row])[0]) for row in rows.tolist()] if rows.size == block.n else ()
 
 
-def copied(taken: BlockTally, frames: Sequence[Frame], first: int) -> Iterator[Frame]:
-    """The frames of another scan as those of a block, numbered from row `first`; `taken` counts them."""
+def copied(tally: BlockTally, frames: Sequence[Frame], first_row: int) -> Iterator[Frame]:
+    """The frames of another scan as those of a block, numbered from row `first_row`; `tally` counts them."""
     for trigger, frame in enumerate(frames):
-        taken.frames += 1
-        taken.rows[trigger] = first + trigger, frame.time
-        yield replace(frame, index=first + trigger, trigger=trigger)
+        tally.frames += 1
+        tally.rows[trigger] = first_row + trigger, frame.time
+        yield replace(frame, index=first_row + trigger, trigger=trigger)
 
 
 REFERENCES = (FrameKind.DARK, FrameKind.FLAT)
@@ -62,8 +62,10 @@ class ReferenceLog:
     def add(self, frame: Frame, digest: FrameDigest) -> None:
         """Add the next frame, in the order of the file. `digest` is the digest for the checks."""
         if frame.kind in REFERENCES or (frame.kind is FrameKind.PROJECTION and len(self.evidence.views) < VIEWS):
-            seen = FrameStatistics.of(frame.index, frame.kind, frame.exposure, digest, check_block(frame.counts.shape))
-            self.evidence = self.evidence.with_frame(seen, begins=frame.kind is not self._before)
+            statistics = FrameStatistics.of(
+                frame.index, frame.kind, frame.exposure, digest, check_block(frame.counts.shape)
+            )
+            self.evidence = self.evidence.with_frame(statistics, begins=frame.kind is not self._before)
         self._before = frame.kind if frame.kind is not FrameKind.INVALID else self._before
         if frame.replaces >= 0:
             self.evidence = self.evidence.without({frame.replaces})
@@ -86,9 +88,9 @@ class ReferenceLog:
     def too_few_photons(self, limits: ReferenceLimits, exposure: float) -> str | None:
         """A warning if noise would dominate the projections because a pixel in the open beam gets few photons;
         otherwise None. `exposure`: exposure of the projections in s."""
-        bad = {row for finding in reference_findings(self.evidence, limits) for row in finding.frames}
-        good = self.evidence.without(bad)
-        flats, darks = (next(iter(good.of_kind(kind)), None) for kind in (FrameKind.FLAT, FrameKind.DARK))
+        faulty_rows = {row for finding in reference_findings(self.evidence, limits) for row in finding.frames}
+        evidence = self.evidence.without(faulty_rows)
+        flats, darks = (next(iter(evidence.of_kind(kind)), None) for kind in (FrameKind.FLAT, FrameKind.DARK))
         n_photons = photons(flats, darks) if flats and darks else None
         if not flats or n_photons is None:
             return None

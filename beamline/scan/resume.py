@@ -139,11 +139,11 @@ class NoFrame(ConfigError):  # noqa: N818 - likewise
 
 
 @contextmanager
-def open_for_resume(run: Path, given: Config | None = None) -> Iterator[ResumableRun]:
+def open_for_resume(run: Path, required_config: Config | None = None) -> Iterator[ResumableRun]:
     """A context that locks the run in this folder, so that no other process can resume it.
 
     Args:
-        given: a configuration that must equal that of the run.
+        required_config: a configuration that must equal that of the run.
 
     Raises:
         ConfigError: the folder is not a run, another process is working on it, or its configuration differs. Its
@@ -152,12 +152,12 @@ def open_for_resume(run: Path, given: Config | None = None) -> Iterator[Resumabl
     """
     if absent := [name for name in (SCAN, CONFIG, EVENTS) if not (run / name).is_file()]:
         raise ConfigError(f"{run} is not the folder of a run: it has no {' and no '.join(absent)}. {_UNTOUCHED}")
-    with _alone(run) as lock:
-        yield _series(run, given, lock)
+    with _locked(run) as lock:
+        yield _resumable_run(run, required_config, lock)
 
 
 @contextmanager
-def _alone(run: Path) -> Iterator[WriterLock]:
+def _locked(run: Path) -> Iterator[WriterLock]:
     """A context in which no other process recovers or continues the run.
 
     Raises:
@@ -178,7 +178,7 @@ def _alone(run: Path) -> Iterator[WriterLock]:
         lock.release()
 
 
-def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
+def _resumable_run(run: Path, required_config: Config | None, lock: WriterLock) -> ResumableRun:
     if is_ride(run):
         raise ConfigError(
             f"{run} recorded the scan of another program, which cannot be continued here. `beamline ride` "
@@ -186,43 +186,44 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
         )
     files, left_out = _files(run)
     config = load(run / CONFIG, environment={})
-    if given is not None and not config.recon.live:
-        given = changed(given, NO_LIVE)
-    planned, retaken, times, parts, closed = 0, 0, list[NDArray[np.float64]](), list[Path](), True
+    if required_config is not None and not config.recon.live:
+        required_config = changed(required_config, NO_LIVE)
+    planned, retaken, frame_times, parts, all_closed = 0, 0, list[NDArray[np.float64]](), list[Path](), True
     for part in files:
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
             require_ours(part, file)
-            for other in (config, given):
-                if other is not None:
-                    require_same_config(run, file["/entry/record/config"].asstr()[()], other)
+            for config_to_compare in (config, required_config):
+                if config_to_compare is not None:
+                    require_same_config(run, file["/entry/record/config"].asstr()[()], config_to_compare)
             if not (angles := views_planned(file)):
                 raise DataError(f"The missing projections are unknown, because {part} has no plan. {_UNTOUCHED}")
             planned = angles
             if file[layout.COMMITTED][()]:
                 table = frames_in(file)  # this raises an error that names a damaged file
                 parts.append(part)
-                closed = closed and bool(file[layout.FINISHED][()])
-                times.append(file[layout.TIME][()])
+                all_closed = all_closed and bool(file[layout.FINISHED][()])
+                frame_times.append(file[layout.TIME][()])
                 numbers = table.triggers[table.views]
                 retaken += int((numbers >= planned).sum())  # their triggers are counted after those of the plan
     if not parts:
         raise NoFrame(f"{run} has no frame: start the scan again. {_UNTOUCHED}")
     with ExitStack() as opened, hdf5.readable(run):
-        each = [opened.enter_context(hdf5.open_hdf5(part)) for part in parts]
-        missing, choices, due = still_to_take(each)
-        offset = offset_taken(each)
-        offset_missing = offset_planned(each[0]) - len(offset)
-        end_references = None if missing else end_references_missing(each)
+        open_files = [opened.enter_context(hdf5.open_hdf5(part)) for part in parts]
+        missing, choices, choice_due = still_to_take(open_files)
+        offset = offset_taken(open_files)
+        offset_missing = offset_planned(open_files[0]) - len(offset)
+        end_references = None if missing else end_references_missing(open_files)
     if not (missing or offset_missing or end_references):
-        _refuse_whole(run, parts, closed)
-    last, seconds = max(float(part.max()) for part in times), sum(float(np.ptp(part)) for part in times)
+        _refuse_complete(run, parts, all_closed)
+    last_frame_time = max(float(part.max()) for part in frame_times)
+    seconds = sum(float(np.ptp(part)) for part in frame_times)
     return ResumableRun(
-        run, lock, config, tuple(parts), frozenset(range(planned)) - missing, planned, last, tuple(left_out),
-        end_references, offset, offset_missing, choices, due, seconds, retaken,
+        run, lock, config, tuple(parts), frozenset(range(planned)) - missing, planned, last_frame_time, tuple(left_out),
+        end_references, offset, offset_missing, choices, choice_due, seconds, retaken,
     )  # fmt: skip
 
 
-def _refuse_whole(run: Path, parts: list[Path], closed: bool) -> None:
+def _refuse_complete(run: Path, parts: list[Path], closed: bool) -> None:
     """Raise NothingMissing; or NotJoined, if the run has all of its frames but a file was not closed or joined."""
     whole = f"{run} has all projections, darks and flats that were planned"
     if closed and (len(parts) == 1 or is_joined(run / JOINED)):
@@ -247,9 +248,9 @@ def require_same_config(run: Path, stored: str, other: Config, name: str = SCAN)
     """Raise ConfigError if the configuration differs from that in a file of the run. (The first line of the file is the
     version of the program.)
     """
-    before, now = stored.splitlines()[1:], resolved_yaml(other).splitlines()[1:]
-    differ = next(((a.strip(), b.strip()) for a, b in zip(before, now, strict=False) if a != b), None)
-    if differ is not None or len(before) != len(now):
+    stored_lines, lines = stored.splitlines()[1:], resolved_yaml(other).splitlines()[1:]
+    differ = next(((a.strip(), b.strip()) for a, b in zip(stored_lines, lines, strict=False) if a != b), None)
+    if differ is not None or len(stored_lines) != len(lines):
         difference = " `{}` instead of `{}`".format(*differ) if differ else ""
         raise ConfigError(f"{run} was taken with another configuration:{difference} in its {name}. {_UNTOUCHED}")
 
@@ -293,18 +294,18 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
         ConfigError: a process is taking, recovering or continuing the run.
         DataError: the folder is not a run, or a part cannot be recovered. Earlier parts are recovered.
     """
-    with _alone(run) if (run / EVENTS).is_file() else nullcontext():  # no process works on the copies of the files
+    with _locked(run) if (run / EVENTS).is_file() else nullcontext():  # no process works on the copies of the files
         files, left_out = _files(run)
         if not files:
             why = f"has no frame: {left_out[0]}" if left_out else f"is not the folder of a run: it has no {SCAN}."
             raise DataError(f"{run} {why} {_UNTOUCHED}")
-        done = [recover(part, say) for part in files]
-        if len(parts := [one.path for one in done if one.frames]) > 1:
+        recovered = [recover(part, say) for part in files]
+        if len(parts := [result.path for result in recovered if result.frames]) > 1:
             changed = not is_joined(run / JOINED)
             if changed:
                 join(parts, run / JOINED)
             with hdf5.open_hdf5(run / JOINED) as file:
                 frames, missing = int(file[layout.COMMITTED][()]), n_still_to_take(file)
-                done.append(Recovered(run / JOINED, changed, frames, 0, missing))
+                recovered.append(Recovered(run / JOINED, changed, frames, 0, missing))
         end_record(parts_of(run)[-1])
-    return done, left_out
+    return recovered, left_out

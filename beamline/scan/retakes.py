@@ -67,6 +67,8 @@ class Retakes:
         self.recorder.wait()
         flagged = self.recorder.flagged.views_to_retake
         # the others were already taken again
-        once = [view for view in flagged if view.trigger < plan.angles.size]
-        bad = sorted([*once, *(Retake(-1, trigger) for trigger in missing)], key=lambda view: view.trigger)
-        return ((), 0) if self.stop.stopping else (spread_retakes(bad, allowed), len(bad))
+        not_yet_repeated = [view for view in flagged if view.trigger < plan.angles.size]
+        candidates = sorted(
+            [*not_yet_repeated, *(Retake(-1, trigger) for trigger in missing)], key=lambda view: view.trigger
+        )
+        return ((), 0) if self.stop.stopping else (spread_retakes(candidates, allowed), len(candidates))

@@ -29,7 +29,7 @@ from beamline.core.run_result import RunResult
 from beamline.core.sinks import Announcer, JsonLines, UserLog, fan_out
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.instrument.connect import ConnectedDevices, clock_after, connect
-from beamline.scan.control import NEXT, State, StateMachine, verbs_taken
+from beamline.scan.control import NEXT, State, StateMachine, commands_taken
 from beamline.scan.dry_run import all_of
 from beamline.scan.live_plan import live_plan
 from beamline.scan.live_process import Commands, LiveCommand, Standby, follow_command, reconstruct
@@ -87,38 +87,41 @@ def run_scan(
     began = time.monotonic()
     stop = stop or StopRequest()
     series = runs if isinstance(runs, ResumableRun) else None
-    place = runs.run if isinstance(runs, ResumableRun) else runs or Path(config.storage.folder)
+    runs_folder = runs.run if isinstance(runs, ResumableRun) else runs or Path(config.storage.folder)
     with ExitStack() as connected:
         if instrument is None:
             clock = clock_after(config, series.last_frame_time if series else 0.0)
             devices = connect(config, clock=clock, ask=ask, check_stop=lambda: _refuse_stop(stop))
             instrument = connected.enter_context(devices)
         instrument.watch_moves(stop.refuse_abort)
-        still = series.remaining if series else all_of
-        ready = preflight(config, instrument, place, still, check_stop=lambda: _refuse_stop(stop))
+        remaining = series.remaining if series else all_of
+        ready = preflight(config, instrument, runs_folder, remaining, check_stop=lambda: _refuse_stop(stop))
         _refuse_stop(stop)
-        folder = series.begin(ready) if series else create_run_folder(place, _named(config), SystemClock().now())
+        folder = (
+            series.begin(ready) if series else create_run_folder(runs_folder, _run_name(config), SystemClock().now())
+        )
         with ExitStack() as stack:
-            sink = _announcing(config, ready, folder, instrument.clock, sinks, stack)
+            sink = _announced_sink(config, ready, folder, instrument.clock, sinks, stack)
             if series is not None:
                 series.lock.release()  # from here on the lock of the part keeps other processes away
-            first = first_state(config, series.run.parent if series else place)
+            first = first_state(config, series.run.parent if series else runs_folder)
             measurement = Measurement(config, instrument, ready, folder, stop, sink, began, series, first_state=first)
             measurement = measurement if turn is None else replace(measurement, turn=turn)
-            stack.enter_context(verbs_taken(folder, stop, measurement.pause, measurement.decider.answer))
-            guarded = stack.enter_context(_watched(measurement))  # held until the instrument is free for another scan
-            guarded.callback(connected.close)
-            how = live if isinstance(live, Commands) else Commands(live=live)
-            return _to_its_end(measurement, how, guarded.close)
+            stack.enter_context(commands_taken(folder, stop, measurement.pause, measurement.decider.answer))
+            # held until the instrument is free for another scan
+            watchdog_stack = stack.enter_context(_watched(measurement))
+            watchdog_stack.callback(connected.close)
+            commands = live if isinstance(live, Commands) else Commands(live=live)
+            return _run_to_end(measurement, commands, watchdog_stack.close)
 
 
 def _watched(measurement: Measurement) -> ExitStack:
     """Start a watchdog for the scan of a real instrument. The watchdog ends when the stack is closed."""
-    config, guarded = measurement.config, ExitStack()
+    config, watchdog_stack = measurement.config, ExitStack()
     if config.simulation is None:
-        without = measurement.pause if config.scan.on_watchdog_loss == "pause" else None
-        guarded.enter_context(watched(measurement.folder, measurement.sink, measurement.stop, without))
-    return guarded
+        pause = measurement.pause if config.scan.on_watchdog_loss == "pause" else None
+        watchdog_stack.enter_context(watched(measurement.folder, measurement.sink, measurement.stop, pause))
+    return watchdog_stack
 
 
 def record_scan(
@@ -147,19 +150,19 @@ def record_scan(
             failed.
     """
     began = time.monotonic()
-    others = ConnectedDevices(cast(Devices, None), SystemClock(), None, lambda: None)  # its devices are never used
+    no_devices = ConnectedDevices(cast(Devices, None), SystemClock(), None, lambda: None)  # its devices are never used
     with ExitStack() as stack:
-        folder = create_run_folder(runs, config.sample.name, others.clock.now())
-        sink = _announcing(config, ready, folder, others.clock, sinks, stack)
+        folder = create_run_folder(runs, config.sample.name, no_devices.clock.now())
+        sink = _announced_sink(config, ready, folder, no_devices.clock, sinks, stack)
         child = ChildProcess if live is None else live.start
-        measurement = Measurement(config, others, ready, folder, stop, sink, began, None, source_of, child=child)
-        stack.enter_context(verbs_taken(folder, stop, measurement.pause))
+        measurement = Measurement(config, no_devices, ready, folder, stop, sink, began, None, source_of, child=child)
+        stack.enter_context(commands_taken(folder, stop, measurement.pause))
         views = live_plan(ready.timing.shape, ready.plan.angles.size, free_memory())
-        how = Commands(live=follow_command(config, views) if live else None)
-        return _to_its_end(measurement, how, lambda: None)
+        commands = Commands(live=follow_command(config, views) if live else None)
+        return _run_to_end(measurement, commands, lambda: None)
 
 
-def _announcing(
+def _announced_sink(
     config: Config, ready: ReadyScan, folder: Path, clock: Clock, sinks: Sequence[Sink], stack: ExitStack
 ) -> Sink:
     """One sink for the record of the run, its logs and `sinks`. A thread passes events on to each, until the stack
@@ -191,7 +194,7 @@ def _logs(config: Config, ready: ReadyScan, folder: Path, stack: ExitStack) -> t
     return record_sink(record), JsonLines(events), UserLog(log)
 
 
-def _named(config: Config) -> str:
+def _run_name(config: Config) -> str:
     """The end of a run folder's name."""
     number = "" if config.scan.state is None else f"_state{config.scan.state}"
     return config.sample.name + number + ("" if config.scan.energy is None else f"_{config.scan.energy:.7g}keV")
@@ -203,29 +206,29 @@ def _refuse_stop(stop: StopRequest) -> None:
         raise ScanAborted(f"Interrupted before the first frame: {stop.reason}. Nothing was moved.")
 
 
-def _to_its_end(measurement: Measurement, how: Commands, release: Callable[[], None]) -> RunResult:
+def _run_to_end(measurement: Measurement, commands: Commands, release: Callable[[], None]) -> RunResult:
     """Run the whole scan, and end it by the event `done` or `failed`."""
     states, series, folder, sink = measurement.states, measurement.series, measurement.folder, measurement.sink
     volume, timeline = (series.run if series else folder) / RECON, measurement.ready.timeline  # of all parts
     try:
         states.enter(State.PREPARING, "Preparing" if series is None else series.in_words)
-        command = None if how.live is None else how.live(folder / SCAN, volume)
+        command = None if commands.live is None else commands.live(folder / SCAN, volume)
         planned = timeline.n_frames, timeline.duration, timeline.total_bytes, timeline.remarks
         sink(RunStarted(folder, folder / SCAN, measurement.config.sample.name, *planned))
         if series is not None:
             _set_aside([volume, volume.with_name(REPORT)], folder.name, states, sink)
-        result = measurement.take(command, release, draws=how.draws)
-        if how.afterwards is not None:  # Ctrl-C ends only the reconstruction
+        result = measurement.take(command, release, draws=commands.draws)
+        if commands.afterwards is not None:  # Ctrl-C ends only the reconstruction
             began = time.monotonic()
-            words = how.afterwards(result.path, volume)
-            recon = reconstruct(words, folder / RECON_LOG, sink, measurement.stop)
+            recon_command = commands.afterwards(result.path, volume)
+            recon = reconstruct(recon_command, folder / RECON_LOG, sink, measurement.stop)
             result = replace(result, recon=recon, seconds=result.seconds + time.monotonic() - began)
     except BaseException as error:
         if is_defect(error):
             leave_traceback(error, folder)
         stopped = State.ABORTED if isinstance(error, ScanAborted) else State.STOPPED
-        in_order = isinstance(error, ScanStopped) and stopped in NEXT[states.state]
-        states.enter(stopped if in_order else State.FAILED, "Ended early")
+        allowed = isinstance(error, ScanStopped) and stopped in NEXT[states.state]
+        states.enter(stopped if allowed else State.FAILED, "Ended early")
         sink(Failed(user_message(error), exit_code(error), folder))
         if isinstance(error, Exception | KeyboardInterrupt):
             raise

@@ -62,7 +62,7 @@ class Run:
 def runs_in(folder: Path) -> list[Path]:
     """The folders of runs in a folder, newest first, including those of a series."""
     runs = [run for place in (folder, *series_in(folder)) for run in place.glob("*/") if is_below(run, EVENTS)]
-    return sorted(runs, key=lambda run: (_began(run), _numbered(run)), reverse=True)
+    return sorted(runs, key=lambda run: (_began(run), _sort_key(run)), reverse=True)
 
 
 def newest(folder: Path) -> Path:
@@ -77,24 +77,24 @@ def newest(folder: Path) -> Path:
 def describe(run: Path) -> Run:
     """The summary of a run from the records of its parts. No pixel is read."""
     # read first, because a new part exists before this lock is released
-    taken_up = held(run / EVENTS, exclusively=True)
+    locked = held(run / EVENTS, exclusively=True)
     parts = [run, *(part for part in parts_of(run)[1:] if is_below(part, EVENTS))]  # it is created after the record
     records = [record_of(part) for part in parts]
     frames: int | None = 0
-    earlier = frames  # of the parts before the newest one
+    earlier_frames = frames  # of the parts before the newest one
     flags: dict[str, dict[str, int]] = {}
     for record in records:
-        before, earlier = 0 if record.joined else frames, frames
+        before, earlier_frames = 0 if record.joined else frames, frames
         frames = None if record.frames is None or before is None else before + record.frames
         for check, levels in record.flags.items():
             flags[check] = dict(Counter(flags.get(check)) + Counter(levels))
-    state = State.PREPARING if taken_up and alive(parts[-1]) is False else records[-1].state
+    state = State.PREPARING if locked and alive(parts[-1]) is False else records[-1].state
     return Run(
         folder=run,
         sample=records[0].sample or run.name.partition("_")[2] or run.name,
         time=_began(run),
         frames=frames,
-        planned=None if records[-1].planned is None or earlier is None else earlier + records[-1].planned,
+        planned=None if records[-1].planned is None or earlier_frames is None else earlier_frames + records[-1].planned,
         flags=flags,
         state=state,
         bytes=sum(_size(Path(folder, name)) for folder, _, names in os.walk(run) for name in names),
@@ -153,7 +153,7 @@ def record_of(part: Path) -> RunRecord:
     record = read_record(part)
     if record is not None and record.state != DIED:
         return record
-    by_file = _by_file(part / SCAN)
+    by_file = _record_of_file(part / SCAN)
     if record is None:
         return by_file
     frames = record.frames if by_file.frames is None else by_file.frames
@@ -162,11 +162,11 @@ def record_of(part: Path) -> RunRecord:
 
 def end_record(part: Path) -> None:
     """Give the record of a part whose process was killed the state of its closed file."""
-    if (record := record_of(part)).state == DIED and (state := _by_file(part / SCAN).state) != NOT_KNOWN:
+    if (record := record_of(part)).state == DIED and (state := _record_of_file(part / SCAN).state) != NOT_KNOWN:
         write_record(part, replace(record, state=state, over=True))
 
 
-def _by_file(scan: Path) -> RunRecord:
+def _record_of_file(scan: Path) -> RunRecord:
     """Values from the beginning of a scan file."""
     from beamline.storage import hdf5
     from beamline.storage.flag_legend import read_flags
@@ -189,7 +189,7 @@ def _began(run: Path) -> float:
     return (run / CONFIG).stat().st_mtime if (run / CONFIG).exists() else 0.0
 
 
-def _numbered(run: Path) -> tuple[int, str]:
+def _sort_key(run: Path) -> tuple[int, str]:
     """Sort key for runs of the same second and sample: the number that distinguishes them, then the name."""
     number = run.name.rpartition("-")[2]
     return (int(number) if number.isdecimal() and "_" in run.name.rpartition("-")[0] else 1), run.name

@@ -118,72 +118,71 @@ def run_series(
             the scans before the error are complete, and a warning names the folder with which the series can be
             continued.
     """
-    each, send = each_scan(config), fan_out(*sinks)
-    with ExitStack() as held:
-        jobs = [None] * len(each) if series is None else [_job(run, held) for run in _runs(series, config)]
-        complete = [(_value(one), job) for one, job in zip(each, jobs, strict=True) if isinstance(job, Path)]
-        if series is not None and len(complete) == len(each):
+    configs, send = each_scan(config), fan_out(*sinks)
+    with ExitStack() as resources:
+        jobs = [None] * len(configs) if series is None else [_job(run, resources) for run in _runs(series, config)]
+        complete = [(_value(each), job) for each, job in zip(configs, jobs, strict=True) if isinstance(job, Path)]
+        if series is not None and len(complete) == len(configs):
             if config.scan.states:
-                _volumes(
-                    [(path, commands(one, None)) for one, (_, path) in zip(each, complete, strict=True)], stop, sinks
-                )
+                paths = [path for _, path in complete]
+                _volumes([(path, commands(each, None)) for each, path in zip(configs, paths, strict=True)], stop, sinks)
             return SeriesRun(series, tuple(complete), ())
-        planned = dry_run(config, series or place, whole=[value for value, _ in complete])
+        planned = dry_run(config, series or place, complete=[value for value, _ in complete])
         refuse_violations(planned.timeline)
-        last = max((job.last_frame_time for job in jobs if isinstance(job, ResumableRun)), default=0.0)
-        clock = clock_after(config, last)
-        instrument = held.enter_context(connect(config, clock=clock, ask=ask, check_stop=stop.refuse_abort))
+        last_frame_time = max((job.last_frame_time for job in jobs if isinstance(job, ResumableRun)), default=0.0)
+        clock = clock_after(config, last_frame_time)
+        instrument = resources.enter_context(connect(config, clock=clock, ask=ask, check_stop=stop.refuse_abort))
         folder = series or _new_folder(config, place or Path(config.storage.folder))
         turns = _Turns(config.scan.states.every_s if config.scan.states else None)
-        seconds = {need.state: need.duration for need in planned.states}
-        scans, results, later = list[tuple[float, Path]](), list[RunResult](), list[tuple[Path, Commands]]()
-        for n, (one, job) in enumerate(zip(each, jobs, strict=True), 1):
+        seconds = {needs.state: needs.duration for needs in planned.states}
+        scans, results, without_volume = list[tuple[float, Path]](), list[RunResult](), list[tuple[Path, Commands]]()
+        for n, (scan_config, job) in enumerate(zip(configs, jobs, strict=True), 1):
             if isinstance(job, Path):
-                scans.append((_value(one), job))
-                later.append((job, commands(one, None) if config.scan.states else Commands()))
+                scans.append((_value(scan_config), job))
+                without_volume.append((job, commands(scan_config, None) if config.scan.states else Commands()))
                 continue
-            number = f"{n} of {len(each)}"
-            which = f"State {number}" if config.scan.states else f"Energy {number}: {_value(one):.7g} keV"
-            _tell(StateEntered(_kind(config), which), sinks)
+            number = f"{n} of {len(configs)}"
+            which = f"State {number}" if config.scan.states else f"Energy {number}: {_value(scan_config):.7g} keV"
+            _send(StateEntered(_kind(config), which), sinks)
             for warning in job.left_out if job else ():
-                _tell(Warned(warning), sinks)
+                _send(Warned(warning), sinks)
             try:
-                how = commands(_within(one, seconds.get(n)), job)
-                if how.remark:
-                    _tell(StateEntered(_kind(config), how.remark), sinks)
-                taken = run_scan(
-                    one, job or folder,
+                scan_commands = commands(_with_time_limit(scan_config, seconds.get(n)), job)
+                if scan_commands.remark:
+                    _send(StateEntered(_kind(config), scan_commands.remark), sinks)
+                result = run_scan(
+                    scan_config, job or folder,
                     [lambda event: None if isinstance(event, RunDone) else send(event)],  # more scans follow
-                    stop, live=replace(how, afterwards=None) if config.scan.states else how, instrument=instrument,
-                    turn=turns.wait if config.scan.states else None,
+                    stop, live=replace(scan_commands, afterwards=None) if config.scan.states else scan_commands,
+                    instrument=instrument, turn=turns.wait if config.scan.states else None,
                 )  # fmt: skip
             except BaseException:
-                _after_failure(folder, _named(one), len(each), sinks)
+                _after_failure(folder, _scan_name(scan_config), len(configs), sinks)
                 raise
-            results.append(taken)
-            scans.append((_value(one), taken.path))
-            later.append((taken.path, how if config.scan.states else Commands()))
-    _volumes(later, stop, sinks)
+            results.append(result)
+            scans.append((_value(scan_config), result.path))
+            without_volume.append((result.path, scan_commands if config.scan.states else Commands()))
+    _volumes(without_volume, stop, sinks)
     return SeriesRun(folder, tuple(scans), tuple(results))
 
 
 @dataclass
 class _Turns:
-    """Decides when each state begins: `every` s after the beginning of the state before, or (None) when `beamline
+    """Decides when each state begins: `interval` s after the beginning of the state before, or (None) when `beamline
     resume` is sent. The first state begins at once.
     """
 
-    every: float | None
-    last: float | None = field(default=None, init=False)
+    interval: float | None
+    last_begin: float | None = field(default=None, init=False)
 
     def wait(self, measurement: Measurement, poll: Callable[[], bool]) -> None:
         """Wait until the scan may begin. A stop ends the wait, and a pause makes it longer."""
         clock, stop, pause, states = (
             measurement.instrument.clock, measurement.stop, measurement.pause, measurement.states,
         )  # fmt: skip
-        name, due = _named(measurement.config), clock.now()
-        if self.last is not None and self.every is not None:
-            due, late = self.last + self.every, due - self.last - self.every
+        name, due = _scan_name(measurement.config), clock.now()
+        if self.last_begin is not None and self.interval is not None:
+            due, late = self.last_begin + self.interval, due - self.last_begin - self.interval
             if late > SLICE:
                 measurement.sink(
                     Warned(f"{name} begins {late:.0f} s late, because the scan of the state before took longer.")
@@ -193,25 +192,25 @@ class _Turns:
                 states.enter(states.state, f"{name} begins in {-late:.0f} s")
             while (remaining := due - clock.now()) > 0 and not stop.stopping:
                 clock.sleep(min(SLICE, remaining))
-        elif self.last is not None:
+        elif self.last_begin is not None:
             pause.pause(f"{name} waits for its trigger")
-        if self.last is not None and pause.reason and not stop.stopping:
+        if self.last_begin is not None and pause.reason and not stop.stopping:
             poll()  # ignore earlier input
             states.enter(State.PAUSED, f"Paused before the first frame: {pause.reason}")
             while pause.reason and not stop.stopping:
                 if poll():
                     pause.resume()
             due = clock.now()
-        self.last = due
+        self.last_begin = due
 
 
-def _within(one: Config, seconds: float | None) -> Config:
+def _with_time_limit(config: Config, seconds: float | None) -> Config:
     """The configuration of a state, changed so that its live volume is finished before the next state begins."""
-    every = one.scan.states.every_s if one.scan.states else None
+    every = config.scan.states.every_s if config.scan.states else None
     if every is None or seconds is None:
-        return one
+        return config
     spare = max(every - seconds, _LEAST_SECONDS)
-    return changed(one, [override_of("recon.seconds", min(one.recon.seconds, spare))])
+    return changed(config, [override_of("recon.seconds", min(config.recon.seconds, spare))])
 
 
 _LEAST_SECONDS = 1.0  # s for the last fit of a live volume
@@ -219,24 +218,24 @@ _LEAST_SECONDS = 1.0  # s for the last fit of a live volume
 
 def _volumes(scans: Sequence[tuple[Path, Commands]], stop: StopRequest, sinks: Sequence[Sink]) -> None:
     """Make the volumes that need complete scans, unless they exist already."""
-    for path, how in scans:
+    for path, commands in scans:
         run = run_of(path.parent)
-        if how.afterwards is not None and not (run / RECON).exists() and not stop.stopping:
-            _tell(StateEntered("states", f"Reconstructing {run.name}"), sinks)
-            reconstruct(how.afterwards(path, run / RECON), run / RECON_LOG, fan_out(*sinks), stop)
+        if commands.afterwards is not None and not (run / RECON).exists() and not stop.stopping:
+            _send(StateEntered("states", f"Reconstructing {run.name}"), sinks)
+            reconstruct(commands.afterwards(path, run / RECON), run / RECON_LOG, fan_out(*sinks), stop)
 
 
 def _kind(config: Config) -> str:
     return "states" if config.scan.states else "energies"
 
 
-def _value(one: Config) -> float:
+def _value(config: Config) -> float:
     """The energy in keV, or the number of the state."""
-    return one.scan.state or one.scan.energy or 0.0
+    return config.scan.state or config.scan.energy or 0.0
 
 
-def _named(one: Config) -> str:
-    return f"State {one.scan.state}" if one.scan.states else f"Energy {one.scan.energy or 0.0:.7g} keV"
+def _scan_name(config: Config) -> str:
+    return f"State {config.scan.state}" if config.scan.states else f"Energy {config.scan.energy or 0.0:.7g} keV"
 
 
 def _new_folder(config: Config, place: Path) -> Path:
@@ -255,14 +254,14 @@ def _runs(series: Path, config: Config) -> list[Path | None]:
     return [run_of_value.get(value) for value in config.series]
 
 
-def _job(run: Path | None, held: ExitStack) -> Path | ResumableRun | None:
+def _job(run: Path | None, resources: ExitStack) -> Path | ResumableRun | None:
     """What must still be done for a scan. Its scan file: nothing, because it is complete. A run: the rest of this run.
     None: a new scan.
     """
     if run is None:
         return None
     try:
-        return held.enter_context(open_for_resume(run))
+        return resources.enter_context(open_for_resume(run))
     except NoFrame:
         return None
     except (NotJoined, NothingMissing):
@@ -274,7 +273,7 @@ def _job(run: Path | None, held: ExitStack) -> Path | ResumableRun | None:
     return scan_file(run)
 
 
-def _tell(event: Event, sinks: Sequence[Sink]) -> None:
+def _send(event: Event, sinks: Sequence[Sink]) -> None:
     fan_out(*sinks)(replace(event, time=SystemClock().now()))
 
 
@@ -283,7 +282,7 @@ def _after_failure(folder: Path, name: str, of: int, sinks: Sequence[Sink]) -> N
     if any(path.is_dir() for path in folder.iterdir()):
         scan = f"{name[0].lower()}{name[1:]}"
         sentence = f"The series of {of} scans ended at {scan}. `beamline scan --resume {folder}` continues it."
-        _tell(Warned(sentence), sinks)
+        _send(Warned(sentence), sinks)
         return
     (folder / CONFIG).unlink()
     folder.rmdir()

@@ -78,9 +78,9 @@ class BeamGuard:
 
     def __init__(self, pause_below: float, resume_above: float, settle: float, pause: PauseRequest) -> None:
         self._pause_below, self._resume_above, self._settle, self._pause = pause_below, resume_above, settle, pause
-        self._good = -math.inf
+        self._last_good_time = -math.inf
         """Time of the last reading with beam."""
-        self._back: float | None = None
+        self._beam_back_since: float | None = None
         """During a pause: the time since which the beam is back."""
         self._paused = False
 
@@ -88,21 +88,21 @@ class BeamGuard:
         """Process the next reading: pause or continue the scan if necessary."""
         if not self._paused:
             if reading.value >= self._pause_below:
-                self._good = reading.time
+                self._last_good_time = reading.time
                 return
             self._paused = True
             self._pause.no_beam(
                 f"the beam monitor reads {reading.value:.4g} {reading.unit}, less than "
                 f"{self._pause_below:.4g}. The scan continues automatically after the reading has been at "
                 f"least {self._resume_above:.4g} for {self._settle:g} s",
-                self._good,
+                self._last_good_time,
             )
         if reading.value < self._resume_above:
-            self._back = None
+            self._beam_back_since = None
             return
-        self._back = reading.time if self._back is None else self._back
-        if reading.time - self._back >= self._settle:
-            self._paused, self._back, self._good = False, None, reading.time
+        self._beam_back_since = reading.time if self._beam_back_since is None else self._beam_back_since
+        if reading.time - self._beam_back_since >= self._settle:
+            self._paused, self._beam_back_since, self._last_good_time = False, None, reading.time
             self._pause.release(Cause.BEAM)
 
 
@@ -124,8 +124,8 @@ class BeamLog:
     ) -> None:
         self._monitor, self._period, self._sink, self._react = monitor, period, sink, react
         self._readings: list[BeamReading] = []
-        self._failed = 0  # number of consecutive failed readings
-        self._begun = self._ended = 0  # number of readings
+        self._n_failed = 0  # number of consecutive failed readings
+        self._n_begun = self._n_ended = 0  # number of readings
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="beam log", daemon=True)
 
@@ -137,8 +137,8 @@ class BeamLog:
     def wait_for_reading(self, stop: Callable[[], bool]) -> None:
         """If readings control the scan, wait for a reading that begins after this call, or until `stop` returns
         True."""
-        due = self._begun + 1
-        while self._react is not None and self._ended < due and self._thread.is_alive() and not stop():
+        due = self._n_begun + 1
+        while self._react is not None and self._n_ended < due and self._thread.is_alive() and not stop():
             time.sleep(PAUSE_POLL)
 
     def __enter__(self) -> Self:
@@ -160,29 +160,29 @@ class BeamLog:
             self._over.wait(self._period)
 
     def _read(self, monitor: BeamMonitor) -> None:
-        self._begun += 1
+        self._n_begun += 1
         try:
             reading = monitor.reading()
         except BaseException as error:  # a failure of the beam monitor never ends the scan
             self._fail(monitor.name, error)
         else:
             self._enter(monitor.name, reading)
-        self._ended = self._begun
+        self._n_ended = self._n_begun
 
     def _enter(self, name: str, reading: BeamReading) -> None:
         if self._over.is_set():  # this reading comes too late to be written
             return
-        if self._failed:
-            self._sink(Warned(f"{name}: it answers again after {count(self._failed, 'failed reading')}."))
-            self._failed = 0
+        if self._n_failed:
+            self._sink(Warned(f"{name}: it answers again after {count(self._n_failed, 'failed reading')}."))
+            self._n_failed = 0
         self._readings.append(reading)
         self._sink(BeamRead(reading.value, reading.unit, reading.time))
         if self._react is not None:
             self._react(reading)
 
     def _fail(self, name: str, error: BaseException) -> None:
-        self._failed += 1  # only a warning, because a failing beam monitor never stops a scan
-        if self._failed > 1 or self._over.is_set():
+        self._n_failed += 1  # only a warning, because a failing beam monitor never stops a scan
+        if self._n_failed > 1 or self._over.is_set():
             return
         problem = str(error) if isinstance(error, DeviceError) else f"{name}: {type(error).__name__}: {error}."
         self._sink(Warned(f"{problem} The scan continues without readings until the monitor answers again."))

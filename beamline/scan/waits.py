@@ -30,34 +30,36 @@ class Waits:
         self._camera, self._clock, self._stop, self._sink = camera, clock, stop, sink
         self._supervision, self._wait_while_paused = supervision, wait_while_paused
 
-    def after_pause(self, i: int, taken: BlockTally) -> int:
-        """Wait as long as the scan is paused. Returns the next trigger: `i`, or the next trigger without a stored
-        frame.
+    def after_pause(self, next_trigger: int, tally: BlockTally) -> int:
+        """Wait as long as the scan is paused. Returns the next trigger: `next_trigger`, or the next trigger without
+        a stored frame.
 
         After a loss of the beam, the next trigger is the first one that may be without beam. This and later triggers
         are repeated.
         """
-        block = taken.block
-        i = next((k for k in range(i, block.n) if k not in block.stored), block.n)
-        if i == block.n and taken.rows and block.kind is not FrameKind.DARK:
+        block = tally.block
+        next_trigger = next(
+            (candidate for candidate in range(next_trigger, block.n) if candidate not in block.stored), block.n
+        )
+        if next_trigger == block.n and tally.rows and block.kind is not FrameKind.DARK:
             self._supervision.wait_for_beam_reading()
         self._wait_while_paused()
         since = self._supervision.pause.take_unlit_since()
-        doubtful = [trigger for trigger, (_, time) in taken.rows.items() if time + block.exposure > since]
+        doubtful = [trigger for trigger, (_, time) in tally.rows.items() if time + block.exposure > since]
         if not doubtful or block.kind is FrameKind.DARK:
-            return i
-        first = min(doubtful)
-        taken.missing[:] = [missing for missing in taken.missing if missing < first]
-        return first
+            return next_trigger
+        first_doubtful = min(doubtful)
+        tally.missing[:] = [missing for missing in tally.missing if missing < first_doubtful]
+        return first_doubtful
 
-    def rest(self, seconds: float, owed: bool) -> bool:
+    def rest(self, seconds: float, still_needed: bool) -> bool:
         """Wait for some seconds. Returns False if a stop ended the wait early. In a block that is still needed, a stop
         does not end the wait.
         """
         deadline = self._clock.now() + seconds
         while seconds > SLICE:
             self._stop.refuse_abort()
-            if self._stop.stopping and not owed:
+            if self._stop.stopping and not still_needed:
                 return False
             self._clock.sleep(SLICE)
             seconds = deadline - self._clock.now()

@@ -62,8 +62,8 @@ def watched(
         stop: request that is set to abort if a watchdog assumed that the scan is dead, and acted. pause: request with
             which the scan is paused after the last watchdog has ended; None: the scan continues without a watchdog.
     """
-    with Path(os.devnull).open("w") as nowhere, inhibited():
-        keeper = _Keeper(folder, sink, lambda command, ready: ChildProcess(command, nowhere, ready, tether=True))
+    with Path(os.devnull).open("w") as devnull, inhibited():
+        keeper = _Keeper(folder, sink, lambda command, ready: ChildProcess(command, devnull, ready, tether=True))
         with closing(keeper):
             keeper.begin(stop or StopRequest(), pause)
             yield
@@ -75,9 +75,9 @@ def inhibited() -> Iterator[None]:
     with ExitStack() as ending:
         if (program := shutil.which(INHIBIT[0])) is not None:
             with suppress(OSError):
-                nowhere = ending.enter_context(Path(os.devnull).open("w"))
-                words = [program, *INHIBIT[1:]]
-                process = ending.enter_context(ChildProcess(words, nowhere, lambda line: None, tether=True))
+                devnull = ending.enter_context(Path(os.devnull).open("w"))
+                command = [program, *INHIBIT[1:]]
+                process = ending.enter_context(ChildProcess(command, devnull, lambda line: None, tether=True))
                 ending.callback(process.let_go)
         yield
 
@@ -152,37 +152,43 @@ def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
     a sentence on each step.
     """
     stage, shutter = config.devices.stage, config.devices.shutter
-    apart = shutter if isinstance(shutter, FoundShutter) else None
+    separate_shutter = shutter if isinstance(shutter, FoundShutter) else None
     closed = "the shutter is moved by hand"
     if not isinstance(shutter, Simple):
-        closed = "its shutter is closed" if apart is None else "the shutter is closed in a separate step"
+        closed = "its shutter is closed" if separate_shutter is None else "the shutter is closed in a separate step"
 
     def disarm() -> None:
         with closing(stage.connect(clock)) as connected:
             if found_settings := connected.describe().get(FOUND):
                 say(f"{connected.name}: {found_settings}.")
             connected.disarm()
-            if apart is None:
+            if separate_shutter is None:
                 shutter_of(config, connected, clock, say).close()
             deadline = clock.now() + PATIENCE  # a stage that slows down does not accept its original settings
             while connected.moving() and clock.now() < deadline:
                 clock.sleep(BETWEEN)
 
-    done = [_insist(lambda: stage.halt(clock), clock, say, "The stage was told to stop.")]
-    if apart:
-        done.append(_insist(lambda: apart.connect(clock).close(), clock, say, "The shutter is closed."))
+    succeeded = [_try_until_done(lambda: stage.halt(clock), clock, say, "The stage was told to stop.")]
+    if separate_shutter:
+        succeeded.append(
+            _try_until_done(lambda: separate_shutter.connect(clock).close(), clock, say, "The shutter is closed.")
+        )
     for name, device in (("sample mover", config.devices.sample_mover), ("filter", config.devices.filter)):
         if isinstance(device, MotorSection):
             halt = partial(device.stage.halt, clock)
-            done.append(_insist(halt, clock, say, f"The {name} was told to stop."))
+            succeeded.append(_try_until_done(halt, clock, say, f"The {name} was told to stop."))
     monochromator = config.devices.monochromator
     if isinstance(monochromator, FoundMonochromator) and monochromator.stops:
-        done.append(_insist(partial(monochromator.halt, clock), clock, say, "The monochromator was told to stop."))
-    done.append(_insist(disarm, clock, say, f"The stage is stopped, its trigger output is disarmed, {closed}."))
-    return all(done)
+        succeeded.append(
+            _try_until_done(partial(monochromator.halt, clock), clock, say, "The monochromator was told to stop.")
+        )
+    succeeded.append(
+        _try_until_done(disarm, clock, say, f"The stage is stopped, its trigger output is disarmed, {closed}.")
+    )
+    return all(succeeded)
 
 
-def _insist(step: Callable[[], None], clock: Clock, say: Callable[[str], None], done: str) -> bool:
+def _try_until_done(step: Callable[[], None], clock: Clock, say: Callable[[str], None], sentence: str) -> bool:
     """Try the step until it works or PATIENCE is over. Returns True if it worked."""
     deadline = clock.now() + PATIENCE
     while True:
@@ -194,11 +200,11 @@ def _insist(step: Callable[[], None], clock: Clock, say: Callable[[str], None], 
                 return False
             clock.sleep(BETWEEN)
         else:
-            say(done)
+            say(sentence)
             return True
 
 
-class _Life:
+class _SignsOfLife:
     """Counts the signs of life from a stream, in a separate thread, because reading a pipe blocks."""
 
     def __init__(self, source: RawIOBase | BytesIO) -> None:
@@ -221,14 +227,14 @@ def until_dead(signs: Callable[[], int | None], clock: Clock) -> bool:
     Args:
         signs: function that returns the number of signs of life so far; None: the process has ended.
     """
-    silent, before = 0.0, clock.now()
-    last = signs()
-    while last is not None:
+    silent_seconds, last_time = 0.0, clock.now()
+    last_count = signs()
+    while last_count is not None:
         clock.sleep(BETWEEN)
-        silent, before = silent + min(clock.now() - before, 2 * BETWEEN), clock.now()
-        if (now := signs()) != last:
-            silent, last = 0.0, now
-        elif silent >= FROZEN:
+        silent_seconds, last_time = silent_seconds + min(clock.now() - last_time, 2 * BETWEEN), clock.now()
+        if (count := signs()) != last_count:
+            silent_seconds, last_count = 0.0, count
+        elif silent_seconds >= FROZEN:
             return True
     return False
 
@@ -243,7 +249,7 @@ def main(folder: Path, scan: int, source: RawIOBase | BytesIO) -> int:
         if (request := getattr(signal, name, None)) is not None:
             signal.signal(request, signal.SIG_IGN)
     config = load(folder / CONFIG, environment={})
-    life, clock = _Life(source), SystemClock()
+    life, clock = _SignsOfLife(source), SystemClock()
 
     with suppress(OSError):  # the scan has died, perhaps before this process was started
         os.write(STDOUT, b"watching\n")

@@ -15,7 +15,7 @@ from beamline.core.errors import BeamlineError, ConfigError, DataError, user_mes
 from beamline.core.text import one_line
 from beamline.page.followed_run import LONGEST, FollowedRun, RunValues, Severity, Stamp, choice_of
 from beamline.plan.passes import Choice
-from beamline.scan.control import Asked, Verb, ask
+from beamline.scan.control import SentCommand, Verb, ask
 from beamline.scan.runs import newest
 
 SHOWN = [each for each in fields(RunValues) if each.name not in ("angle", "flag_names", "flag_counts")]
@@ -59,7 +59,7 @@ class RunServer:
         self._say, self._now, self._beats = say, now, 0
         self._run = FollowedRun(runs, now)
         # process variables (PVs) whose clients wait, with the operations of the clients
-        self._asked: deque[tuple[Any, Any, Asked]] = deque()
+        self._asked: deque[tuple[Any, Any, SentCommand]] = deque()
         provider, self._shown = StaticProvider("splatline"), dict[str, Any]()
         for each in SHOWN:
             about = {"display.description": each.metadata["about"], "display.units": each.metadata["unit"]}
@@ -138,7 +138,7 @@ class RunServer:
         except (BeamlineError, OSError) as error:
             self._end(pv, op, error)
 
-    def _answer(self, pv: Any, op: Any, asked: Asked) -> None:
+    def _answer(self, pv: Any, op: Any, asked: SentCommand) -> None:
         """Answer the client of a command that is done. If the command is not done yet, the client waits for the next
         call of `look`."""
         try:

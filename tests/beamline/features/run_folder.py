@@ -10,7 +10,7 @@ from typing import Any
 
 from beamline.core.files import CONFIG
 from beamline.core.stop import PauseRequest, StopRequest
-from beamline.scan.control import verbs_taken
+from beamline.scan.control import commands_taken
 from beamline.storage.run_record import RecordFile, RunRecord
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
@@ -43,5 +43,5 @@ def asking(run: Path) -> Iterator[list[str]]:
             record.put(RunRecord("acquiring"), at_once=True)
             answers.append(str(choice))
 
-        with verbs_taken(run, StopRequest(), PauseRequest(), take):
+        with commands_taken(run, StopRequest(), PauseRequest(), take):
             yield answers

@@ -18,7 +18,7 @@ from beamline.core.stop import PauseRequest, StopRequest
 from beamline.page.run_files import Reader, watched
 from beamline.plan.passes import Choice
 from beamline.scan import control
-from beamline.scan.control import State, Verb, running, state_of, tell, verbs_taken
+from beamline.scan.control import State, Verb, commands_taken, running, state_of, tell
 from beamline.storage.run_record import RecordFile, RunRecord
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran
@@ -54,7 +54,7 @@ def test_a_run_is_paused_resumed_and_complete(tmp_path: Path) -> None:
 
 def test_only_the_owner_may_ask_and_nothing_is_left(tmp_path: Path) -> None:
     pause = PauseRequest()
-    with verbs_taken(tmp_path, StopRequest(), pause):
+    with commands_taken(tmp_path, StopRequest(), pause):
         if os.name == "posix":
             assert (tmp_path / "control").stat().st_mode & 0o777 == 0o700
         asked(tmp_path, Verb.PAUSE)
@@ -73,13 +73,13 @@ def test_the_commands_say_what_became_of_the_scan(tmp_path: Path, monkeypatch: p
     assert "no scan is running in runs" in CliRunner().invoke(main, ["pause"]).stderr
     stop = StopRequest()
     files = [RecordFile(runs[0], RunRecord(State.ACQUIRING))]
-    with verbs_taken(runs[0], stop, PauseRequest()):
+    with commands_taken(runs[0], stop, PauseRequest()):
         assert running(Path("runs")) == [Path("runs/a")]
         result = CliRunner().invoke(main, ["stop"])
         assert result.exit_code == 0 and result.stdout == f"{Path('runs/a')}: acquiring\n"
         assert stop.stopping and not stop.aborting
         files.append(RecordFile(runs[1], RunRecord(State.PREPARING)))
-        with verbs_taken(runs[1], stop, PauseRequest()):
+        with commands_taken(runs[1], stop, PauseRequest()):
             result = CliRunner().invoke(main, ["abort"])
             assert result.exit_code == 2 and "2 scans are running in runs: a, b" in result.stderr
             assert CliRunner().invoke(main, ["abort", str(runs[1])]).exit_code == 0
@@ -119,7 +119,7 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
             threading.Timer(0.3 if choice is Choice.RETAKE else 0, write).start()  # which is another thread's
         enter(State.TAXI)
 
-    with verbs_taken(run, StopRequest(), PauseRequest(), choose):
+    with commands_taken(run, StopRequest(), PauseRequest(), choose):
         refused = CliRunner().invoke(main, ["decide", "again"])
         assert (
             refused.exit_code == 2
@@ -199,7 +199,7 @@ def test_nobody_else_may_put_a_folder_in_the_place_of_ours(tmp_path: Path, umask
     before = os.umask(umask)
     try:
         run = create_run_folder(tmp_path / "runs", "foam", 0.0)
-        with verbs_taken(run, StopRequest(), PauseRequest()):
+        with commands_taken(run, StopRequest(), PauseRequest()):
             modes = [stat.S_IMODE(folder.stat().st_mode) for folder in (run, create_part(run), run / "control")]
     finally:
         os.umask(before)

@@ -154,7 +154,7 @@ def test_a_dry_run_counts_all_energies(config: Path, tmp_path: Path) -> None:
     assert sum(each["duration"] for each in all_["energies"]) == pytest.approx(
         4 * one["duration"], rel=0.03
     )  # each begins later in angle
-    rest = dry_run(load(config), whole=ENERGIES[:3])
+    rest = dry_run(load(config), complete=ENERGIES[:3])
     assert [need.kev for need in rest.energies] == [ENERGIES[3]]
     assert rest.needs.total_bytes == one["total_bytes"]  # the disk needs no room for those that were taken
     told = beamline("scan", config, "--dry-run", "-o", tmp_path / "none")

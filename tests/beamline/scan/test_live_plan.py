@@ -21,7 +21,7 @@ def test_the_live_volume_fits_into_half_of_the_memory(
     shape: tuple[int, int], n_views: int, free: float, planned: tuple[int, int]
 ) -> None:
     plan = live_plan(shape, n_views, int(free))
-    assert (plan.binning, plan.every) == planned
+    assert (plan.binning, plan.one_in) == planned
     assert plan.bytes <= free / 2
 
 

@@ -124,7 +124,7 @@ def test_the_plan_counts_all_states_and_the_time_between_them(config: Path, tmp_
     assert needs.parts["flat"] == pytest.approx(own["flat"] / STATES), "flats are copied"
     late = beamline("scan", config, "--dry-run", "--set", "scan.states.every_s=1").stdout
     assert "so the next state begins later than planned" in late
-    rest = dry_run(load(config), whole=[1, 2])
+    rest = dry_run(load(config), complete=[1, 2])
     assert [need.state for need in rest.states] == [3] and rest.needs.duration == pytest.approx(last)
 
 
@@ -264,7 +264,8 @@ def test_flats_of_both_ends_are_of_the_first_state(config: Path) -> None:
 def test_the_example_of_a_series_of_states_can_run() -> None:
     planned = dry_run(load(config_folder() / "states.yaml"))
     assert not planned.timeline.violations
-    assert len(planned.states) == 4 and planned.every == 20 and max(one.duration for one in planned.states) < 20
+    assert len(planned.states) == 4 and planned.state_interval == 20
+    assert max(one.duration for one in planned.states) < 20
 
 
 @pytest.mark.slow

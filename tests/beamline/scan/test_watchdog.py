@@ -122,7 +122,7 @@ def test_what_cannot_be_said_or_done_keeps_no_other_step_from_being_tried(
 
     def safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
         say("The stage was told to stop.")
-        made.append(watchdog._insist(lambda: 1 / 0, VirtualClock(), say, "never"))  # type: ignore[arg-type]
+        made.append(watchdog._try_until_done(lambda: 1 / 0, VirtualClock(), say, "never"))  # type: ignore[arg-type]
         return True
 
     monkeypatch.setattr(watchdog, "make_safe", safe)

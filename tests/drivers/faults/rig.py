@@ -29,7 +29,7 @@ from beamline.core.stop import Cause, PauseRequest, StopRequest
 from beamline.instrument.connect import ConnectedDevices, connect
 from beamline.scan import measurement
 from beamline.scan import run as run_module
-from beamline.scan.control import verbs_taken
+from beamline.scan.control import commands_taken
 from beamline.scan.recorder import Recorder
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
@@ -358,7 +358,7 @@ class Rig:
             serial, "serial_for_url", lambda url, **how: opens(simulated if url == PORT else url, **how)
         )
         monkeypatch.setattr(run_module, "connect", self._connect)
-        monkeypatch.setattr(run_module, "verbs_taken", self._verbs_taken)
+        monkeypatch.setattr(run_module, "commands_taken", self._verbs_taken)
         monkeypatch.setattr(measurement, "wait_in_pause", self._wait_in_pause)
         monkeypatch.setattr(run_module, "watched", lambda *how: nullcontext())  # a process a scan
         monkeypatch.setattr(measurement, "Recorder", partial(_Recorder, self.at_frame))
@@ -429,7 +429,7 @@ class Rig:
     @contextmanager
     def _verbs_taken(self, folder: Path, stop: StopRequest, pause: PauseRequest, *choose: Any) -> Iterator[None]:
         self.pause = pause
-        with verbs_taken(folder, stop, pause, *choose):
+        with commands_taken(folder, stop, pause, *choose):
             yield
 
     def _wait_in_pause(self, recorder: Recorder) -> bool:

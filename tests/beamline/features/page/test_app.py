@@ -18,7 +18,7 @@ from beamline.core.stop import PauseRequest, StopRequest
 from beamline.features.page.serve import CONNECTIONS, open_port
 from beamline.monitor.check import Level
 from beamline.page.recording import Recording
-from beamline.scan.control import verbs_taken
+from beamline.scan.control import commands_taken
 from beamline.storage.run_record import RunRecord, write_record
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import write_volume
@@ -190,7 +190,7 @@ def test_a_stop_does_not_wait_for_other_requests(tmp_path: Path, monkeypatch: py
     free, stop = threading.Event(), StopRequest()
     monkeypatch.setattr(Recording, "facts", lambda file: {"free": free.wait(60)})
     with (
-        served(tmp_path, control=True) as page, verbs_taken(tmp_path, stop, PauseRequest()),
+        served(tmp_path, control=True) as page, commands_taken(tmp_path, stop, PauseRequest()),
         ThreadPoolExecutor(61) as pool,
     ):  # fmt: skip
         others = [pool.submit(page.ask, "/api/facts") for _ in range(60)]
