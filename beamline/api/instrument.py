@@ -96,8 +96,8 @@ class Instrument:
         """Run a scan in the same way as `beamline scan`: in a new folder, with a check of every frame, and with a file
         that stays readable after a failure.
 
-        The first Ctrl-C stops the scan cleanly, and the second Ctrl-C aborts it. The stop and the abort both raise an
-        error, so each of them also ends a loop over samples. If this function runs in another thread than the main
+        The first Ctrl-C stops the scan cleanly, and the second Ctrl-C aborts it. After a stop or an abort, `scan`
+        raises an error, so that a loop over several samples ends, too. If this function runs in another thread than the main
         thread, use `stop` instead of Ctrl-C, because Python delivers signals only to the main thread.
 
         Args:
@@ -109,7 +109,7 @@ class Instrument:
             output: folder in which the run's folder is created; None: `storage.folder`.
             live: False: without a live reconstruction, even if `recon.live` is on.
             stop: a `StopRequest`, with which another thread can stop or abort the scan.
-            on_event: function that gets every event of the run. The function is called in a separate thread.
+            on_event: function that gets every event of the run, called in a separate thread.
 
         Raises:
             ConfigError: a value is wrong, exceeds a limit, or belongs to a key that only `connect` can apply. Nothing

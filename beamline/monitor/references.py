@@ -187,7 +187,7 @@ def _saturated(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrame
             odd = [group[place] for place in np.flatnonzero(over).tolist()]
             yield BadFrames(odd, most, limit, f"{what}. Shorten the exposure or add a filter.")
         elif all(flat.constant for flat in group):
-            what = f"every pixel is {level(group):g}, although pixels of the darks vary: all pixels are saturated"
+            what = f"all pixels are saturated: every pixel is {level(group):g}, although the darks have noise"
             yield BadFrames(group, 1.0, limit, f"{what}. Shorten the exposure or add a filter.")
 
 

@@ -83,7 +83,7 @@ class RunValues:
     )
     option_sizes: tuple[float, ...] = published("OptionSizes", "size of the data of each choice in Options", (), "GB")
     recommended: str = published(
-        "Recommended", "the recommended choice of Options; a scan that decides by itself takes this choice", ""
+        "Recommended", "the choice in Options that the program recommends, and takes if the scan decides by itself", ""
     )
     wait: float = published(
         "AnswerWithin",

@@ -125,11 +125,11 @@ class CheckpointOptions:
         if steps != saved.steps or steps == 0:
             was, now = (f"{n} steps" if n else "a time limit" for n in (saved.steps, steps))
             plans = (
-                f"with a plan for {was}, and the present fit has a plan for {now}"
+                f"The checkpoint is from a fit that was planned for {was}, but this fit is planned for {now}"
                 if was != now
-                else "with a time limit, and the present fit also has a time limit"
+                else "The checkpoint is from a fit with a time limit, and this fit also has a time limit"
             )
-            warn(f"The checkpoint is from a fit {plans}: the learning rates continue at the same step of the new plan.")
+            warn(f"{plans}: the learning rates continue at the same step of the new plan.")
         return saved.state
 
     def write(self, origin: Mapping[str, Value], steps: int, warn: Warn, state: Mapping[str, NDArray[Any]]) -> str:

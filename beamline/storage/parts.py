@@ -213,7 +213,7 @@ def _disagreement(joined: h5py.File, folder: Path) -> str:
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
             committed = int(file[layout.COMMITTED][()])
             if committed != n:
-                return f"the part {part} has {committed} frames instead of {n}, as when the parts were joined"
+                return f"the part {part} has {committed} frames, but had {n} when the parts were joined"
     others = [other for other in other_parts(parts[0]) if not any(same_file(other, part) for part in parts)]
     return f"the frames of {others[0]} are missing" if others else ""
 

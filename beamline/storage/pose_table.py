@@ -297,7 +297,8 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
     named = {way[-1] for way in ways} - {"0"}
     if not named <= set(moved) or len(named) < sum(way != "0" for way in ways):
         raise _NoPosesError(
-            f"{path}: {','.join(ways)} must name two translations that the file has ({', '.join(moved)}); {_HOW}"
+            f"{path}: {','.join(ways)} does not name two of the sample translations in the file ({', '.join(moved)}); "
+            f"{_HOW}"
         )
     shifts = [np.zeros(kinds.size) if way == "0" else (-1 if way[0] == "-" else 1) * moved[way[-1]] for way in ways]
     rows = np.flatnonzero(shown)

@@ -215,7 +215,7 @@ class Geometry:
         scan.
 
         Only the middle half of the displacements, sorted by size, counts, so that single displaced projections have no
-        effect. In a helical scan, the middle half of the sorted displacements spans half of the full displacement.
+        effect. In a helical scan, this middle half spans half of the whole displacement along the axis.
         """
         low, high = np.percentile(self.offsets[:, 1], (25, 75))
         return bool(4 * (high - low) >= self.detector_shape[0])

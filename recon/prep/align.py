@@ -229,9 +229,9 @@ def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
         angles: [view], radians.
 
     Returns:
-        The estimate from all projections, if it is confident. If the estimate from all projections is not confident,
-        the function returns a confident estimate from opposite projections, from the two ends of the scan, or from one
-        pair of projections. If no estimate is confident, the function returns the estimate from all projections.
+        The estimate from all projections; if this estimate is not confident, a confident estimate from opposite
+        projections, from the two ends of the scan, or from one pair of projections; if no estimate is confident, the
+        estimate from all projections.
 
     Raises:
         ValueError: `axis_from_sinogram` cannot use the projections or the angles.

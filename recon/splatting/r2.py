@@ -109,7 +109,7 @@ class R2(Fit):
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
         """A fit that takes projections during a scan, and starts with `gaussians` Gaussians.
 
-        The fit has the settings `WHILE_VIEWS_COME`, except for values of `fit` that differ from the defaults.
+        The fit has the settings `WHILE_VIEWS_COME`; values of `fit` that differ from their defaults override them.
 
         Raises:
             ValueError: as for `StreamingFit`, or `gaussians` is a model instead of a number.

@@ -109,7 +109,7 @@ class StreamingFit:
                 values that are far too large. Nothing is added.
 
         Warns:
-            UserWarning: the angles so far look like degrees. The warning comes only once.
+            UserWarning: the angles so far look like degrees (at most one warning in a fit).
         """
         check_arguments(StreamingFit.add_views, locals())
         theta, before = np.atleast_1d(np.asarray(angles, np.float64)), self._stage.views

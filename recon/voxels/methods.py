@@ -44,9 +44,10 @@ class FistaTv(HalfVoxels):
     The iterations end when the volume has converged: after about 20 iterations with 180 projections, and about 35 with
     30 projections. Memory: 8 volumes and 2 times the projections.
 
-    With 3 dual steps, a cathode from 45 projections of 512 columns had not converged after 60 iterations on whole
-    voxels (22.8 dB). With 12 dual steps, the same cathode has converged after 45 iterations (23.3 dB). From 180
-    projections, the volume converges in 19 iterations with 12 dual steps, and in 27 with 3 (tests/bench/ends.py).
+    The number of dual steps was chosen on a cathode of 512 columns, on whole voxels (tests/bench/ends.py). From 45
+    projections, the volume of this cathode does not converge in 60 iterations with 3 dual steps (22.8 dB), but in 45
+    iterations with 12 dual steps (23.3 dB). From 180 projections, the volume of the cathode converges in 27 iterations
+    with 3 dual steps and in 19 iterations with 12.
 
     Attributes:
         iterations: largest number of iterations over all projections.
@@ -261,7 +262,7 @@ class PnpDct(VoxelMethod):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """No settings: a time limit cannot end PnP-DCT, because its number of steps is fixed."""
+        """Empty, because a time limit cannot end PnP-DCT: its number of steps is fixed."""
         return {}
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:

@@ -118,9 +118,9 @@ class Projector:
 
         Sharpening that removes the variance s (px²) raises the finest detail by the factor 1 + 2 s. Detail along the
         rotation axis is raised by all projections. Detail across the axis is raised only by projections whose
-        directions nearly agree: they differ by less than a voxel at the edge of the field of view. The upper limit
-        assumes that all projections contribute to the eigenvector of the largest eigenvalue, unless a few rays weigh
-        more than the others.
+        directions nearly agree: they differ by less than a voxel at the edge of the field of view. The share of these
+        projections is computed as if all projections contributed equally to the eigenvector of the largest eigenvalue;
+        if some rays weigh more than others, the share is raised.
         """
         if self.sharpened is None:
             return 1.0

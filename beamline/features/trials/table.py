@@ -165,7 +165,7 @@ def _conclusions(table: TrialTable) -> list[str]:
             f"+{gain:.2f} dB with {highest.trial.label}, but the difference may be chance (± "
             f"{table.chance(highest, best):.2f} dB)."
         )
-        out.append(f"No other trial is significantly better. The highest value: {chance}")
+        out.append(f"No other trial is significantly better. The highest quality is {chance}")
     return out
 
 

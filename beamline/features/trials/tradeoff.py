@@ -92,7 +92,9 @@ def _note(n_views: int) -> str:
 def _notes_on_methods(settings: Mapping[str, Mapping[str, Plain]], seconds: float | None) -> list[str]:
     words = {method: ", ".join(f"{name} {value}" for name, value in own.items()) for method, own in settings.items()}
     in_time = (
-        [] if seconds is None else [f"Each row had {seconds:g} s; methods without iterations took the time they need."]
+        []
+        if seconds is None
+        else [f"Each reconstruction had {seconds:g} s; methods without iterations took as long as they need."]
     )
     return [*(f"{method}: {own}." for method, own in words.items() if own), *in_time]
 

@@ -165,7 +165,7 @@ def parts_joined(scan: ScanEvidence) -> Iterator[Finding]:
         sentence = f"This file is one of {n} parts of a scan: use {joined}, which has the frames of all parts"
     elif others := other_parts(scan.source.path):
         other_part = others[0]
-        sentence = f"This file is a part of a run, like {other_part}, and no file joins the parts"
+        sentence = f"This file has only a part of the scan; {other_part} has another part. Join the parts"
         sentence += f": {to_join(run_of(scan.source.path.resolve().parent))}"
     else:
         return

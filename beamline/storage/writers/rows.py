@@ -158,8 +158,8 @@ def put_exchange_view(path: Path) -> None:
     """
     if (free := shutil.disk_usage(path.parent).free) < ROOM:
         raise DataError(
-            f"{path}: its disk has {size(free)} free, and {size(ROOM)} are needed for the /exchange view. "
-            "Nothing was changed."
+            f"{path}: its disk has {size(free)} free, but {size(ROOM)} are needed to add the /exchange view (links "
+            "under which other programs find the frames). Nothing was changed."
         )
     try:
         with hdf5.changed(path, layout.LIBVER) as file:

@@ -71,7 +71,7 @@ class HomeSearch:
             reply=status.raw,
             expected="to be on the home switch",
             advice="Check the switch and its settings on the controller's panel, then search again",
-            state=f"The stage is at {status.counts} counts, which are not counted from the reference",
+            state=f"The stage is at {status.counts} counts, but the search is not complete, so its angle is unknown",
         )
 
 

@@ -68,7 +68,7 @@ class Basis(Enum):
     """How the number of a block's first frame was found, as the end of a sentence."""
 
     GIVEN = "the frame that ride.first_id states"
-    NUMBERS = "the frame whose number follows the number of the last frame before the block"
+    NUMBERS = "the frame whose number is one above that of the last frame before the block"
     COUNTER = "the frame with the number that was calculated from the camera's counter"
     WAITED = "the first frame that arrived"
     UNKNOWN = "the first frame that arrived, although earlier frames may be lost"

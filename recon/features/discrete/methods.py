@@ -125,8 +125,8 @@ class Discrete(HalfVoxels):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """No settings: a time limit cannot end discrete tomography, because it needs all iterations of its tests to
-        find levels."""
+        """Empty, because a time limit cannot end discrete tomography: it needs all iterations of its tests to find
+        levels."""
         return {}
 
     def toy(self) -> Self:
@@ -134,7 +134,8 @@ class Discrete(HalfVoxels):
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """How well the method predicts held-out projections: with the best discrete levels, or with total variation
-        alone if no levels are better. If a simpler candidate has that volume already, the method counts as not tried.
+        alone if no levels are better. If a simpler candidate already has the volume of total variation alone, the
+        method counts as not tried.
         """
         if trial.weight is None:
             return Prediction(

@@ -56,8 +56,8 @@ class Materials:
         y, x], 0 to 1. For example, the share of a charged material is the state of charge of a battery electrode.
 
         Args:
-            least: a share is computed where the densities of all these materials add up to this value or more.
-                Voxels with a smaller sum of densities get NaN.
+            least: a share is computed where the densities of all these materials add up to this value or more;
+                voxels with a smaller sum get NaN.
         """
         part = self.densities[of]
         total = part + self.densities[list(others)].sum(0)

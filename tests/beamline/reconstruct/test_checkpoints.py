@@ -105,7 +105,7 @@ def test_it_comes_through_the_file_and_back(tmp_path: Path, prepared: PreparedPr
     assert state.keys() == _state().keys()
     np.testing.assert_array_equal(state["statistic"], np.zeros(5))
     again.begin(origin, 200, said.append)
-    assert "100 steps, and the present fit has a plan for 200 steps" in said[0]
+    assert "100 steps, but this fit is planned for 200 steps" in said[0]
     with refused(DataError):
         again.begin(origin_of(prepared, replace(SETTINGS, loss="l2"), OTHERS), 100, said.append)
 
@@ -113,9 +113,9 @@ def test_it_comes_through_the_file_and_back(tmp_path: Path, prepared: PreparedPr
 @pytest.mark.parametrize(
     ("kept", "wanted", "words"),
     [
-        (0, 0, "from a fit with a time limit, and the present fit also has a time limit:"),
-        (100, 0, "from a fit with a plan for 100 steps, and the present fit has a plan for a time limit:"),
-        (0, 200, "from a fit with a plan for a time limit, and the present fit has a plan for 200 steps:"),
+        (0, 0, "from a fit with a time limit, and this fit also has a time limit:"),
+        (100, 0, "from a fit that was planned for 100 steps, but this fit is planned for a time limit:"),
+        (0, 200, "from a fit that was planned for a time limit, but this fit is planned for 200 steps:"),
     ],
 )
 def test_a_plan_without_steps_is_told(

@@ -98,7 +98,7 @@ def test_in_equal_time_all_but_direct_methods_have_it(folder: Path, seen: list[A
     result = beamline("study", "fixed-views", "many.h5", "--axis", "20.7", "-m", "sirt", "-m", "fbp", "--seconds", "3")
     assert result.exit_code == 0, result.output
     assert [trial.seconds_asked for trial, _ in seen] == [None, 3.0, 3.0, None, 3.0, None]
-    assert "Each row had 3 s" in result.stdout
+    assert "Each reconstruction had 3 s" in result.stdout
 
 
 def test_windows_reach_the_method_as_means_of_light(folder: Path, seen: list[Any]) -> None:

@@ -283,7 +283,7 @@ def test_translations_of_an_nxtomo_file_need_their_directions(tmp_path: Path) ->
     found = prepared(path, f"{motors}:x,-z").geometry.shifts
     np.testing.assert_allclose(found - found[0], SHIFTS - SHIFTS[0], atol=1e-9)  # but for a common one
     assert np.abs(np.median(found, axis=0)).max() < 1e-9
-    with pytest.raises(ValueError, match=r"y,x must name two translations that the file has \(x, z\)"):
+    with pytest.raises(ValueError, match=r"y,x does not name two of the sample translations in the file \(x, z\)"):
         read_poses(f"{motors}:y,x")
     with pytest.raises(DataError, match="in a cone beam, translations of the sample in mm are not shifts"):
         prepared(path, f"{motors}:x,-z", cone=(50.0, 60.0))

@@ -116,7 +116,7 @@ def test_no_view_is_begun_where_there_is_no_room_for_it(
     assert len(writer.remarks) == 1
     assert "no /exchange view: " in writer.remarks[0]
     assert re.search(
-        r"has 500 B free, and \S+ MB are needed for the /exchange view.*1 frames are safe", writer.remarks[0]
+        r"has 500 B free, but \S+ MB are needed to add the /exchange view.*1 frames are safe", writer.remarks[0]
     )
     with h5py.File(tmp_path / "s.h5") as file:
         assert list(file["exchange"]) == []
