@@ -97,8 +97,8 @@ class Instrument:
         that stays readable after a failure.
 
         The first Ctrl-C stops the scan cleanly, and the second Ctrl-C aborts it. After a stop or an abort, `scan`
-        raises an error, so that a loop over several samples ends, too. If this function runs in another thread than the main
-        thread, use `stop` instead of Ctrl-C, because Python delivers signals only to the main thread.
+        raises an error, so that a loop over several samples ends, too. If this function runs in another thread than the
+        main thread, use `stop` instead of Ctrl-C, because Python delivers signals only to the main thread.
 
         Args:
             sample: name of the sample, which is written to the file and into the folder's name; None: the configured
