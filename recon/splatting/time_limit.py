@@ -79,34 +79,36 @@ class FinishPlan(NamedTuple):
     trials: bool = True
 
 
-def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid: Grid, now: Clock) -> FinishPlan:
+def finish_within(seconds: float, seconds_after_steps: float, geometry: Geometry, grid: Grid, now: Clock) -> FinishPlan:
     """Plan the voxel refinement of a fit within `seconds`.
 
-    `beside_steps` is the time that the fitting steps leave. If `seconds` and `beside_steps` are enough, the plan is the
+    `seconds_after_steps` is the time that the fitting steps leave. If it and `seconds` are enough, the plan is the
     default refinement with PnP-DCT and test reconstructions. Otherwise the plan has at most the usual number of
     iterations. If time is short, the weight is chosen without test reconstructions. (For few rows, test reconstructions
     take longer than seven refinements.) If there is time for fewer than two iterations, the plan has no iterations,
-    because the work before the iterations takes as long as two of them.
+    because the work before the iterations takes longer than two of them.
     """
     if seconds <= 0:
         return FinishPlan(0, 0.0)
     sweep = sweep_seconds(geometry, grid, now)
-    before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, MANY_SUBSETS, to_the_end=False) + _FIRST_SWEEPS) * sweep
-    choice, patches = choice_sweeps(geometry, early=True) * sweep, PnpDct()
-    most, room = before + FINISH_SWEEPS * sweep, seconds
-    if choice:  # otherwise there are too few projections to hold some out, and PnP-DCT is not tried
+    setup_seconds = (_EIGENVALUE_ROUNDS / subsets_of(geometry, MANY_SUBSETS, to_the_end=False) + _FIRST_SWEEPS) * sweep
+    choice_seconds, patches = choice_sweeps(geometry, early=True) * sweep, PnpDct()
+    full_seconds, available = setup_seconds + FINISH_SWEEPS * sweep, seconds
+    if choice_seconds:  # otherwise there are too few projections to hold some out, and PnP-DCT is not tried
         trials_of_patches = EARLY_CHOICE_SWEEPS + TRIAL_SWEEPS + TRIALS * patches.trial_steps
         refused = sum(each.refused_sweeps for each in pull_methods(iterations=PULLED_SWEEPS))
-        most += patches.iterations * sweep + choice * (trials_of_patches + refused) / EARLY_CHOICE_SWEEPS
-        room = min(seconds, beside_steps)
-    if most <= room:
-        return FinishPlan(None, most)
-    trials = before + choice + FINISH_SWEEPS * sweep <= seconds
-    before += choice if trials else 0.0
-    if not before + 2 * sweep <= seconds:
+        full_seconds += (
+            patches.iterations * sweep + choice_seconds * (trials_of_patches + refused) / EARLY_CHOICE_SWEEPS
+        )
+        available = min(seconds, seconds_after_steps)
+    if full_seconds <= available:
+        return FinishPlan(None, full_seconds)
+    trials = setup_seconds + choice_seconds + FINISH_SWEEPS * sweep <= seconds
+    setup_seconds += choice_seconds if trials else 0.0
+    if not setup_seconds + 2 * sweep <= seconds:
         return FinishPlan(0, 0.0)
-    sweeps = min(FINISH_SWEEPS, int((seconds - before) / sweep)) if sweep > 0 else FINISH_SWEEPS
-    return FinishPlan(sweeps, before + sweeps * sweep, trials)
+    sweeps = min(FINISH_SWEEPS, int((seconds - setup_seconds) / sweep)) if sweep > 0 else FINISH_SWEEPS
+    return FinishPlan(sweeps, setup_seconds + sweeps * sweep, trials)
 
 
 def planned_finish(method: Fit, remaining: float, steps: float, problem: ReconProblem, now: Clock) -> FinishPlan:
@@ -115,9 +117,9 @@ def planned_finish(method: Fit, remaining: float, steps: float, problem: ReconPr
 
     If there is time for two iterations, and the method states a number of iterations, the plan has this number.
     """
-    room, geometry = FINISH_SHARE * remaining, problem.geometry.at_row(0)
-    plan = finish_within(room, remaining - steps, geometry, problem.grid, now)
-    return plan if method.finish is None or plan.sweeps == 0 else plan._replace(sweeps=method.finish, seconds=room)
+    available, geometry = FINISH_SHARE * remaining, problem.geometry.at_row(0)
+    plan = finish_within(available, remaining - steps, geometry, problem.grid, now)
+    return plan if method.finish is None or plan.sweeps == 0 else plan._replace(sweeps=method.finish, seconds=available)
 
 
 @dataclass(frozen=True, eq=False)

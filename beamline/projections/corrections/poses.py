@@ -154,7 +154,11 @@ class ScanPoses:
 
 
 def poses_of(scan: SelectedScan, frames: I64) -> ScanPoses | None:
-    """The poses of `frames` from the file of the selection, otherwise from the scan file. None if neither states poses.
+    """The poses of all frames of the scan, NaN for a frame without a pose: from the file of --poses, otherwise from the
+    scan file. None if neither states poses, or with --poses ignore.
+
+    Args:
+        frames: int64 [view], the frames that are used.
 
     Raises:
         ConfigError: options exclude each other.
@@ -169,13 +173,13 @@ def poses_of(scan: SelectedScan, frames: I64) -> ScanPoses | None:
             "--tilt and --poses both set the roll of the projections. Omit --tilt, and add the tilt to the column "
             f"roll_deg of {table.path}."
         )
-    for learns in (step.requested_by for step in geometry_steps(selection) if step.geometry):
+    for option in (step.requested_by for step in geometry_steps(selection) if step.geometry):
         raise ConfigError(
-            f"{learns} determines from the projections what {table.path} already states. Give either {learns} or "
+            f"{option} determines from the projections what {table.path} already states. Give either {option} or "
             "--poses. To omit the shifts that the scan states, add --poses ignore."
         )
     shifts = table.shifts * _pixels_per_unit(table, scan)
-    rows = _rows_of_frames(table, source, frames)
+    table_rows = _rows_of_frames(table, source, frames)
     height, width = source.shape
     # the displacement of offset projections is at most a few fields of view
     if (too_far := (np.abs(shifts) >= (8 * width, height)).any(axis=1)).any():
@@ -190,7 +194,8 @@ def poses_of(scan: SelectedScan, frames: I64) -> ScanPoses | None:
         )
     n = len(source.table)
     pose_of_frame = np.full((n, 4), np.nan)
-    pose_of_frame[rows >= 0] = np.column_stack((shifts, np.radians(table.turns_deg)))[rows[rows >= 0]]
+    has_pose = table_rows >= 0
+    pose_of_frame[has_pose] = np.column_stack((shifts, np.radians(table.turns_deg)))[table_rows[has_pose]]
     pivot, sentence = selection.pivot, _sentence(table, shifts)
     poses = ScanPoses(
         table,
@@ -204,7 +209,7 @@ def poses_of(scan: SelectedScan, frames: I64) -> ScanPoses | None:
     )
     if table.vectors is None:
         return poses
-    return replace(poses, vectors=_of_vectors(table, scan), view_of=rows)
+    return replace(poses, vectors=_of_vectors(table, scan), view_of=table_rows)
 
 
 def _of_vectors(table: PoseTable, scan: SelectedScan) -> Geometry:
