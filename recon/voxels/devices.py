@@ -79,7 +79,7 @@ class VoxelDevice(Protocol[Array]):
     def denoise(self, x: Array, threshold: float, nonnegative: bool, scratch: Any, out: Array) -> None: ...
 
     def pulled_step(
-        self, x: Array, change: Array, momentum: float, pace: float, gradient: Array, pull: float, z: Array,
+        self, x: Array, change: Array, momentum: float, step_size: float, gradient: Array, pull: float, z: Array,
         nonnegative: bool,
     ) -> None: ...  # fmt: skip
 

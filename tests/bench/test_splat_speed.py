@@ -23,7 +23,7 @@ from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.kernels.cpu import lanes
 from recon.kernels.cpu.activation import OPTIONS
-from recon.kernels.cpu.engine import Active, Gradients, camera, grid_layout, seen_from
+from recon.kernels.cpu.engine import Active, Gradients, camera, grid_layout, relative_to_centre
 from recon.kernels.cpu.footprints import HU, HV, KV, SHEAR, K, U, V, W, footprint_table, footprints
 from recon.kernels.cpu.project import moments, render, render_layers
 from recon.splatting import optimise as fit
@@ -43,7 +43,7 @@ Timing = tuple[float, ...]
 def view_table(active: Active, geometry: Geometry, view: int, faint: float, sigmas: float) -> F32:
     """Footprints [n, 8] of all Gaussians in one view, rectified and affine; `faint` in units of the image."""
     table = footprint_table(active.densities.shape[0])
-    a = seen_from(active, geometry, view)
+    a = relative_to_centre(active, geometry, view)
     parameters = (a.means, a.scales, a.rotations, a.densities)
     footprints(*parameters, camera(geometry, view), faint, sigmas, table, kernel=a.kernel)
     return table

@@ -75,7 +75,7 @@ def camera(geometry: Geometry, view: int) -> RayCamera:
     return RayCamera(axes, 1 / geometry.pixel_pitch, 0.0, col, row, straight, *width)
 
 
-def seen_from(active: Active, geometry: Geometry, view: int) -> Active:
+def relative_to_centre(active: Active, geometry: Geometry, view: int) -> Active:
     """The Gaussians relative to the centre of the projection, where its axes start."""
     centre = geometry.centres[view]
     return replace(active, means=active.means - centre.astype(np.float32)) if centre.any() else active
@@ -110,7 +110,7 @@ class RenderedView:
         image: line integrals [row, col].
         active: the Gaussians relative to the centre of the projection; they and `scratch` must not change before
             `backward`.
-        into: the gradients to which `backward` adds.
+        gradient_sums: the gradients to which `backward` adds.
         camera: the projection.
         length: see `RayModel.length`.
         scratch: contains the table of footprints.
@@ -120,7 +120,7 @@ class RenderedView:
 
     image: F32
     active: Active
-    into: Gradients
+    gradient_sums: Gradients
     camera: RayCamera
     length: float
     scratch: Scratch
@@ -128,35 +128,42 @@ class RenderedView:
     rays: CpuRays | None
 
     def backward(self, gradient: F32) -> F32:
-        """Back-propagate an image gradient [row, col] and add the result to `into`; returns the gradient of centres [n,
-        2] in pixels."""
-        a, into, table = self.active, self.into, self.scratch.table
-        centres = np.empty((len(into.densities), 2), np.float32)
-        under = moments(table, gradient, self.scratch.moments, a.kernel)
-        added = into.means, into.log_scales, into.rotations, into.densities
+        """Back-propagate an image gradient [row, col] and add the result to `gradient_sums`; returns the gradient of
+        centres [n, 2] in pixels."""
+        a, gradient_sums, table = self.active, self.gradient_sums, self.scratch.table
+        centres = np.empty((len(gradient_sums.densities), 2), np.float32)
+        gradient_moments = moments(table, gradient, self.scratch.moments, a.kernel)
+        sums = gradient_sums.means, gradient_sums.log_scales, gradient_sums.rotations, gradient_sums.densities
         if self.camera.is_wide:
             parameters = a.means, a.scales, a.rotations
-            wide_footprints_backward(table, under, parameters, self.camera, added, centres, a.kernel)
+            wide_footprints_backward(table, gradient_moments, parameters, self.camera, sums, centres, a.kernel)
         else:
             footprints_backward(
-                table, under, a.means, a.scales, a.rotations, a.densities, self.camera, *added, centres,
+                table, gradient_moments, a.means, a.scales, a.rotations, a.densities, self.camera, *sums, centres,
                 length=self.length, kernel=a.kernel,
             )  # fmt: skip
         if self.rays is None:
             return centres
-        some, moved = Gradients.zeros(self.exact.size), np.empty((self.exact.size, 2), np.float32)
-        self.rays.backward(gradient, some.means, some.log_scales, some.rotations, some.densities, moved)
-        centres[self.exact] = moved
-        into.means[self.exact] += some.means
-        into.log_scales[self.exact] += some.log_scales
-        into.rotations[self.exact] += some.rotations
-        into.densities[self.exact] += some.densities
+        exact_gradients, exact_centres = Gradients.zeros(self.exact.size), np.empty((self.exact.size, 2), np.float32)
+        self.rays.backward(
+            gradient,
+            exact_gradients.means,
+            exact_gradients.log_scales,
+            exact_gradients.rotations,
+            exact_gradients.densities,
+            exact_centres,
+        )
+        centres[self.exact] = exact_centres
+        gradient_sums.means[self.exact] += exact_gradients.means
+        gradient_sums.log_scales[self.exact] += exact_gradients.log_scales
+        gradient_sums.rotations[self.exact] += exact_gradients.rotations
+        gradient_sums.densities[self.exact] += exact_gradients.densities
         return centres
 
 
 def render_view(
     active: Active,
-    into: Gradients,
+    gradient_sums: Gradients,
     geometry: Geometry,
     view: int,
     faint: float,
@@ -168,24 +175,24 @@ def render_view(
 
     `scratch` is overwritten. If projections share it, call `backward` of one before the next is rendered.
     """
-    shape, a = geometry.detector_shape, seen_from(active, geometry, view)
-    picture = np.empty(shape, np.float32)
-    projection, length = camera(geometry, view), model.length(geometry)
+    shape, a = geometry.detector_shape, relative_to_centre(active, geometry, view)
+    image = np.empty(shape, np.float32)
+    ray_camera, length = camera(geometry, view), model.length(geometry)
     footprints(
-        a.means, a.scales, a.rotations, a.densities, projection, faint, sigmas, scratch.table,
+        a.means, a.scales, a.rotations, a.densities, ray_camera, faint, sigmas, scratch.table,
         length=length, exact_above=model.exact_above, kernel=a.kernel,
     )  # fmt: skip
-    if projection.is_wide:
-        widen(scratch.table, a.means, projection, faint, sigmas, a.kernel)
-    render(scratch.table, picture, scratch.layers, a.kernel)
+    if ray_camera.is_wide:
+        widen(scratch.table, a.means, ray_camera, faint, sigmas, a.kernel)
+    render(scratch.table, image, scratch.layers, a.kernel)
     exact, rays = np.empty(0, np.intp), None
     if geometry.is_cone and model.exact_above < math.inf:
         exact = np.flatnonzero(scratch.table[:, HU] == INEXACT)
     if exact.size:
-        some = (a.means[exact], a.scales[exact], a.rotations[exact], a.densities[exact])
-        rays = CpuRays(some, projection, shape, faint, sigmas, a.kernel)
-        rays.add_to(picture)
-    return RenderedView(picture, a, into, projection, length, scratch, exact, rays)
+        exact_parameters = (a.means[exact], a.scales[exact], a.rotations[exact], a.densities[exact])
+        rays = CpuRays(exact_parameters, ray_camera, shape, faint, sigmas, a.kernel)
+        rays.add_to(image)
+    return RenderedView(image, a, gradient_sums, ray_camera, length, scratch, exact, rays)
 
 
 def grid_layout(active: Active, grid: Grid, faint: float, sigmas: float) -> Layout:

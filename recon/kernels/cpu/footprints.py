@@ -88,7 +88,7 @@ class RayCamera(NamedTuple):
 
 
 @njit(inline="always", fastmath=True)
-def _turned(x, y, z, r):
+def _rotated(x, y, z, r):
     """Rᵀ times a vector."""
     return x * r[0] + y * r[3] + z * r[6], x * r[1] + y * r[4] + z * r[7], x * r[2] + y * r[5] + z * r[8]
 
@@ -241,9 +241,9 @@ def _backward(straight: bool) -> Any:
                 ax, ay = (u0 * x + u1 * y + u2 * z) / depth, (v0 * x + v1 * y + v2 * z) / depth
                 g, rr = f / depth, _f(1) + ax * ax + ay * ay
             r, s0, s1, s2 = rotations[i], scales[i, 0], scales[i, 1], scales[i, 2]
-            pu0, pu1, pu2 = _turned(u0, u1, u2, r)
-            pv0, pv1, pv2 = _turned(v0, v1, v2, r)
-            pd0, pd1, pd2 = _turned(d0, d1, d2, r)
+            pu0, pu1, pu2 = _rotated(u0, u1, u2, r)
+            pv0, pv1, pv2 = _rotated(v0, v1, v2, r)
+            pd0, pd1, pd2 = _rotated(d0, d1, d2, r)
             b0, b1, b2 = s0 * (pv0 - ay * pd0), s1 * (pv1 - ay * pd1), s2 * (pv2 - ay * pd2)
             i0, i1, i2 = _f(1) / s0, _f(1) / s1, _f(1) / s2
             h0, h1 = (ax * pu0 + ay * pv0 + pd0) * i0, (ax * pu1 + ay * pv1 + pd1) * i1

@@ -135,7 +135,7 @@ def store(typing_context, array, row, col, lanes):
     return types.void(array, types.intp, types.intp, LANES), code
 
 
-def _turned(builder: Any, rows: list[Any]) -> list[Any]:
+def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
     """Sixteen vectors, transposed: rows and lanes are exchanged, one bit of their numbers at a time."""
     for bit in (1, 2, 4, 8):
         low = [lane if not lane & bit else WIDTH + lane - bit for lane in range(WIDTH)]
@@ -145,42 +145,42 @@ def _turned(builder: Any, rows: list[Any]) -> list[Any]:
     return rows
 
 
-def _steps(context: Any, builder: Any, signature: Any, args: Any) -> tuple[list[Any], list[Any]]:
+def _addresses(context: Any, builder: Any, signature: Any, args: Any) -> tuple[list[Any], list[Any]]:
     """Addresses of array[row + i, col + shifts[i]] and of other[other_row + i, 0]."""
-    kinds, places, others = signature.args, [], []
+    types_of_args, addresses, other_addresses = signature.args, [], []
     for i in range(WIDTH):
         number = ir.Constant(args[1].type, i)
-        shifts = context.make_array(kinds[3])(context, builder, args[3])
+        shifts = context.make_array(types_of_args[3])(context, builder, args[3])
         col = builder.add(args[2], builder.load(builder.gep(shifts.data, [number])))
-        places.append(_address(context, builder, kinds[0], args[0], builder.add(args[1], number), col))
+        addresses.append(_address(context, builder, types_of_args[0], args[0], builder.add(args[1], number), col))
         row, start = builder.add(args[5], number), ir.Constant(args[1].type, 0)
-        others.append(_address(context, builder, kinds[4], args[4], row, start))
-    return places, others
+        other_addresses.append(_address(context, builder, types_of_args[4], args[4], row, start))
+    return addresses, other_addresses
 
 
 @intrinsic
-def load_turned(typing_context, array, row, col, shifts, out, out_row):
+def load_transposed(typing_context, array, row, col, shifts, out, out_row):
     """out[out_row + k, i] = array[row + i, col + shifts[i] + k], i and k below sixteen; `shifts` of type intp."""
 
     def code(context, builder, signature, args):
-        places, others = _steps(context, builder, signature, args)
-        found = _turned(builder, [builder.load(place, align=4) for place in places])
-        for vector, other in zip(found, others, strict=True):
-            builder.store(vector, other, align=4)
+        addresses, out_addresses = _addresses(context, builder, signature, args)
+        vectors = _transposed(builder, [builder.load(source_address, align=4) for source_address in addresses])
+        for vector, address in zip(vectors, out_addresses, strict=True):
+            builder.store(vector, address, align=4)
         return context.get_dummy_value()
 
     return types.void(array, types.intp, types.intp, shifts, out, types.intp), code
 
 
 @intrinsic
-def add_turned(typing_context, array, row, col, shifts, source, source_row):
-    """array[row + i, col + shifts[i] + k] += source[source_row + k, i]: the transpose of `load_turned`."""
+def add_transposed(typing_context, array, row, col, shifts, source, source_row):
+    """array[row + i, col + shifts[i] + k] += source[source_row + k, i]: the transpose of `load_transposed`."""
 
     def code(context, builder, signature, args):
-        places, others = _steps(context, builder, signature, args)
-        found = _turned(builder, [builder.load(other, align=4) for other in others])
-        for vector, place in zip(found, places, strict=True):
-            builder.store(builder.fadd(builder.load(place, align=4), vector, flags=_FAST), place, align=4)
+        addresses, source_addresses = _addresses(context, builder, signature, args)
+        vectors = _transposed(builder, [builder.load(source_address, align=4) for source_address in source_addresses])
+        for vector, address in zip(vectors, addresses, strict=True):
+            builder.store(builder.fadd(builder.load(address, align=4), vector, flags=_FAST), address, align=4)
         return context.get_dummy_value()
 
     return types.void(array, types.intp, types.intp, shifts, source, types.intp), code

@@ -52,19 +52,19 @@ def _columns(start, cols, width):
 @njit(inline="always", fastmath=True)
 def _down(plane, row, first, window):
     """The window applied down the columns of plane [row, col], zeros outside, for sixteen columns."""
-    amount = lanes.zero()
-    for other in range(max(0, row - RADIUS), min(plane.shape[0], row + RADIUS + 1)):
-        amount = amount + lanes.load(plane, other, first) * window[other - row + RADIUS]
-    return amount
+    blurred = lanes.zero()
+    for window_row in range(max(0, row - RADIUS), min(plane.shape[0], row + RADIUS + 1)):
+        blurred = blurred + lanes.load(plane, window_row, first) * window[window_row - row + RADIUS]
+    return blurred
 
 
 @njit(inline="always", fastmath=True)
 def _across(half, k, first, window):
     """The window applied along line k of half (column 0 at index MARGIN, zeros on both sides), for sixteen columns."""
-    amount = lanes.zero()
+    blurred = lanes.zero()
     for tap in range(2 * RADIUS + 1):
-        amount = amount + lanes.load(half, k, first + (MARGIN - RADIUS) + tap) * window[tap]
-    return amount
+        blurred = blurred + lanes.load(half, k, first + (MARGIN - RADIUS) + tap) * window[tap]
+    return blurred
 
 
 @njit(**OPTIONS)
@@ -99,11 +99,11 @@ def _ssim_terms(
             for start in range(0, width, lanes.WIDTH):
                 first, _, _ = _columns(start, cols, width)
                 bx, bxx, bxy = lanes.zero(), lanes.zero(), lanes.zero()
-                for other in range(max(0, row - RADIUS), min(rows, row + RADIUS + 1)):
-                    x = lanes.load(image, other, first)
-                    weighted = x * window[other - row + RADIUS]
+                for window_row in range(max(0, row - RADIUS), min(rows, row + RADIUS + 1)):
+                    x = lanes.load(image, window_row, first)
+                    weighted = x * window[window_row - row + RADIUS]
                     bx, bxx = bx + weighted, bxx + weighted * x
-                    bxy = bxy + weighted * lanes.load(target, other, first)
+                    bxy = bxy + weighted * lanes.load(target, window_row, first)
                 lanes.store(half, 0, first + MARGIN, bx)
                 lanes.store(half, 1, first + MARGIN, bxx)
                 lanes.store(half, 2, first + MARGIN, bxy)
@@ -201,18 +201,18 @@ class CpuProjectionLoss:
         self._halves = np.zeros((-(-rows // TASK_ROWS), 3, self._width + 2 * MARGIN), np.float32)
         self._partials = np.empty((3, rows, self._width), np.float32)
         self._sums = np.empty(rows, np.float64)
-        self._slope = np.empty((rows, self._width), np.float32)
+        self._gradient = np.empty((rows, self._width), np.float32)
 
-    def _wide(self, image: F32) -> F32:
+    def _padded(self, image: F32) -> F32:
         if image.shape[1] == self._width:
             return np.ascontiguousarray(image)
-        wide = np.zeros((image.shape[0], self._width), np.float32)
-        wide[:, : self._cols] = image
-        return wide
+        padded_image = np.zeros((image.shape[0], self._width), np.float32)
+        padded_image[:, : self._cols] = image
+        return padded_image
 
     def target_maps(self, target: F32, weights: F32 | None = None) -> F32:
         """Blurred m y and m y² of a target image, [2, row, col] with at least sixteen columns."""
-        wide = self._wide(target if weights is None else target * (weights > 0))
+        wide = self._padded(target if weights is None else target * (weights > 0))
         out = np.empty((2, *wide.shape), np.float32)
         for plane, blurred in zip((wide, wide * wide), out, strict=True):
             _blur(plane, self.window, self._halves, blurred)
@@ -226,23 +226,24 @@ class CpuProjectionLoss:
         `target_maps` must have the same weights. Image and target must be finite also where the weight is 0.
         """
         pixels = image.size
-        x, y, cols = self._wide(image), self._wide(target), self._cols
-        w, seen = None, x
+        wide_image, wide_target, cols = self._padded(image), self._padded(target), self._cols
+        weight_image, masked_image = None, wide_image
         if weights is not None:
-            w = self._wide(weights)
-            seen = x * (w > 0)
+            weight_image = self._padded(weights)
+            masked_image = wide_image * (weight_image > 0)
         _ssim_terms(
-            seen, y, w, cols, target_maps, self.window, self.c1, self.c2, self._halves, self._partials, self._sums
+            masked_image, wide_target, weight_image, cols, target_maps, self.window, self.c1, self.c2, self._halves,
+            self._partials, self._sums,
         )  # fmt: skip
         ssim = float(self._sums.sum()) / pixels
-        share = 1.0 if weights is None else float(weights.mean(dtype=np.float64))
-        weight = self.ssim_weight / pixels
+        mean_weight = 1.0 if weights is None else float(weights.mean(dtype=np.float64))
+        ssim_weight = self.ssim_weight / pixels
         _combine(
-            x, y, w, cols, self._partials, self.window, self.term, 1.0 / pixels, weight, self._halves, self._slope,
-            self._sums,
+            wide_image, wide_target, weight_image, cols, self._partials, self.window, self.term, 1.0 / pixels,
+            ssim_weight, self._halves, self._gradient, self._sums,
         )  # fmt: skip
-        loss = float(self._sums.sum()) / pixels + self.ssim_weight * (share - ssim)
-        return loss, np.ascontiguousarray(self._slope[:, :cols])
+        loss = float(self._sums.sum()) / pixels + self.ssim_weight * (mean_weight - ssim)
+        return loss, np.ascontiguousarray(self._gradient[:, :cols])
 
 
 @njit(**OPTIONS)

@@ -61,7 +61,7 @@ def _row(y, first, scale, rows):
 
 
 @njit(inline="always", fastmath=True)
-def _between(table, n, t, m):
+def _interpolated(table, n, t, m):
     return table[n, m] + t * (table[n + 1, m] - table[n, m])
 
 
@@ -76,15 +76,15 @@ def _mean(y, f, share, shares, likelihoods, levels, kept, partial, first, scale,
     """z of a value y whose neighbours have the shares f [K]; writes the posterior of each material to `share` [K]."""
     count = levels.size
     n, t = _row(y, first, scale, shares.shape[0])
-    own, mass, moment = _f(1), _f(0), _f(0)
+    single, mass, moment = _f(1), _f(0), _f(0)
     for m in range(count - 1):
         q = _f(least) + _f(most - least) * min(_f(4) * f[m] * f[m + 1], _f(1))
-        own -= q
+        single -= q
         mass += q * partial[m]
     moment = mass * y
-    own = max(own, _f(LEAST_OF_MATERIALS))
+    single = max(single, _f(LEAST_OF_MATERIALS))
     for m in range(count):
-        share[m] = (own * f[m] + _f(LEAST_OF_EACH)) * _between(likelihoods, n, t, m)
+        share[m] = (single * f[m] + _f(LEAST_OF_EACH)) * _interpolated(likelihoods, n, t, m)
         mass += share[m]
         moment += share[m] * (levels[m] + kept[m] * (y - levels[m]))
     for m in range(count):
@@ -95,28 +95,28 @@ def _mean(y, f, share, shares, likelihoods, levels, kept, partial, first, scale,
 @njit(**OPTIONS)
 def _posterior(
     x: F32, shares: F32, likelihoods: F32, levels: F32, kept: F32, partial: F32, first: float, scale: float,
-    least: float, most: float, tall: int, wide: int, blur: F32, out: F32, probabilities: F32,
+    least: float, most: float, n_planes: int, n_lines: int, blur: F32, out: F32, probabilities: F32,
 ) -> None:  # fmt: skip
     na, nb, nc = x.shape
     rows, count = shares.shape
-    along = -(-nb // wide)
-    for block in prange(-(-na // tall) * along):
-        a0, b0 = block // along * tall, block % along * wide
-        a1, b1 = min(a0 + tall, na), min(b0 + wide, nb)
-        own = np.empty((count, a1 - a0 + 4, b1 - b0 + 4, nc), np.float32)
+    blocks_in_plane = -(-nb // n_lines)
+    for block in prange(-(-na // n_planes) * blocks_in_plane):
+        a0, b0 = block // blocks_in_plane * n_planes, block % blocks_in_plane * n_lines
+        a1, b1 = min(a0 + n_planes, na), min(b0 + n_lines, nb)
+        voxel_shares = np.empty((count, a1 - a0 + 4, b1 - b0 + 4, nc), np.float32)
         for i in range(a0 - 2, a1 + 2):
             for j in range(b0 - 2, b1 + 2):
                 line = x[min(max(i, 0), na - 1), min(max(j, 0), nb - 1)]
                 for k in range(nc):
                     n, t = _row(line[k], first, scale, rows)
                     for m in range(count):
-                        own[m, i - a0 + 2, j - b0 + 2, k] = _between(shares, n, t, m)
+                        voxel_shares[m, i - a0 + 2, j - b0 + 2, k] = _interpolated(shares, n, t, m)
         f, g = np.empty((count, b1 - b0 + 4, nc), np.float32), np.empty((count, nc), np.float32)
-        here, share = np.empty(count, np.float32), np.empty(count, np.float32)
+        neighbour_shares, share = np.empty(count, np.float32), np.empty(count, np.float32)
         for i in range(a1 - a0):
             for m in range(count):
                 for j in range(b1 - b0 + 4):
-                    p = own[m]
+                    p = voxel_shares[m]
                     _blur(blur, p[i, j], p[i + 1, j], p[i + 2, j], p[i + 3, j], p[i + 4, j], f[m, j])
             for j in range(b1 - b0):
                 for m in range(count):
@@ -127,10 +127,10 @@ def _posterior(
                     for m in range(count):
                         q = g[m]
                         sides = blur[2] * (q[low] + q[high]) + blur[1] * (q[before] + q[after])
-                        here[m] = sides + blur[0] * q[k]
+                        neighbour_shares[m] = sides + blur[0] * q[k]
                     out[a0 + i, b0 + j, k] = _mean(
-                        x[a0 + i, b0 + j, k], here, share, shares, likelihoods, levels, kept, partial, first, scale,
-                        least, most,
+                        x[a0 + i, b0 + j, k], neighbour_shares, share, shares, likelihoods, levels, kept, partial,
+                        first, scale, least, most,
                     )  # fmt: skip
                     for m in range(probabilities.shape[0]):
                         probabilities[m, a0 + i, b0 + j, k] = share[m]
@@ -143,7 +143,7 @@ def posterior_mean(x: F32, table: MaterialTable, out: F32, probabilities: F32 | 
         probabilities: [K, a, b, c], replaced by the posterior probability of each material; the rest up to one is the
             probability of a partial voxel. None: the caller does not need them.
     """
-    wide = max(_SHORTEST, min(x.shape[1], round((_BLOCK / x.shape[2]) ** 0.5)))
-    tall = max(_SHORTEST, min(x.shape[0], _BLOCK // (x.shape[2] * wide)))
-    wanted = np.empty((0, *x.shape), np.float32) if probabilities is None else probabilities
-    _posterior(x, *table, tall, wide, np.array(BLUR, np.float32), out, wanted)
+    n_lines = max(_SHORTEST, min(x.shape[1], round((_BLOCK / x.shape[2]) ** 0.5)))
+    n_planes = max(_SHORTEST, min(x.shape[0], _BLOCK // (x.shape[2] * n_lines)))
+    probabilities_out = np.empty((0, *x.shape), np.float32) if probabilities is None else probabilities
+    _posterior(x, *table, n_planes, n_lines, np.array(BLUR, np.float32), out, probabilities_out)

@@ -46,10 +46,10 @@ def _crossing(rays, v, first, end, j, n):
     """Columns low..high (excluded) of a group whose rays may have samples in the band from line j on."""
     middle = j + _BAND / 2
     rising = rays[v, end - 1, 0] + rays[v, end - 1, 1] * middle >= rays[v, first, 0] + rays[v, first, 1] * middle
-    found = first
+    low = first
     for side in range(2):
         bound = -1.0 - _BAND / 2 if rising == (side == 0) else n + _BAND / 2
-        a, b = found if side == 1 else first, end
+        a, b = low if side == 1 else first, end
         while a < b:
             col = (a + b) // 2
             beyond = rays[v, col, 0] + rays[v, col, 1] * middle >= bound
@@ -58,12 +58,12 @@ def _crossing(rays, v, first, end, j, n):
             else:
                 a = col + 1
         if side == 0:
-            found = a
-    return found, a
+            low = a
+    return low, a
 
 
 @njit(inline="always")
-def _lean(rays, v, first, end, shifts, offsets):
+def _shifts_of_lines(rays, v, first, end, shifts, offsets):
     """Number of voxels by which each line of a band is shifted for this group of rays."""
     step = (rays[v, first, 1] + rays[v, end - 1, 1]) / 2
     for i in range(_BAND):
@@ -72,15 +72,15 @@ def _lean(rays, v, first, end, shifts, offsets):
 
 
 @njit(inline="always")
-def _row(rays, v, col, j):
+def _row_and_distance(rays, v, col, j):
     """The first of the four rows between which a ray runs, and the distance of the ray from it in line j, for the first
     lane.
 
     If a ray meets a voxel exactly, compiled calls may round differently, and rows then differ by one.
     """
-    at = rays[v, col, 0] + rays[v, col, 1] * j
-    row = math.floor(at - 1.0)
-    return row, _f(at - row)
+    position = rays[v, col, 0] + rays[v, col, 1] * j
+    row = math.floor(position - 1.0)
+    return row, _f(position - row)
 
 
 @njit(**OPTIONS)
@@ -95,26 +95,27 @@ def _forward(ys: F32, xs: F32, shape: tuple[int, int], rays: F64, steep: Flags, 
             lines = ys if axis == 0 else xs
             first, last = _group(rays, steep, v, axis, 0)
             while first < last:
-                _lean(rays, v, first, last, shifts, offsets)
+                _shifts_of_lines(rays, v, first, last, shifts, offsets)
                 for j in range(0, lines.shape[0], _BAND):
                     low, high = _crossing(rays, v, first, last, j, shape[1 - axis])
                     if high <= low:
                         continue
-                    one, other = _row(rays, v, low, j)[0], _row(rays, v, high - 1, j)[0]
-                    top, bottom = min(one, other) - 1, max(one, other) + 5  # see _row
+                    row_low = _row_and_distance(rays, v, low, j)[0]
+                    row_high = _row_and_distance(rays, v, high - 1, j)[0]
+                    top, bottom = min(row_low, row_high) - 1, max(row_low, row_high) + 5  # see _row_and_distance
                     for row in range(0, bottom - top, _BAND):
-                        lanes.load_turned(lines, j, _BEFORE + top + row, shifts, band, row)
+                        lanes.load_transposed(lines, j, _BEFORE + top + row, shifts, band, row)
                     offset = lanes.load(offsets, 0, 0)
                     for col in range(low, high):
-                        row, far = _row(rays, v, col, j)
+                        row, distance = _row_and_distance(rays, v, col, j)
                         row -= top
-                        at = lanes.iota() * _f(rays[v, col, 1]) + offset + far
+                        position = lanes.iota() * _f(rays[v, col, 1]) + offset + distance
                         a, b = lanes.load(band, row, 0), lanes.load(band, row + 1, 0)
                         c, d = lanes.load(band, row + 2, 0), lanes.load(band, row + 3, 0)
-                        found = a + (b - a) * lanes.clamp(at, _f(0), _f(1))
-                        found = found + (c - b) * lanes.clamp(at - _f(1), _f(0), _f(1))
-                        found = found + (d - c) * lanes.clamp(at - _f(2), _f(0), _f(1))
-                        lanes.store(total, col, 0, lanes.load(total, col, 0) + found)
+                        value = a + (b - a) * lanes.clamp(position, _f(0), _f(1))
+                        value = value + (c - b) * lanes.clamp(position - _f(1), _f(0), _f(1))
+                        value = value + (d - c) * lanes.clamp(position - _f(2), _f(0), _f(1))
+                        lanes.store(total, col, 0, lanes.load(total, col, 0) + value)
                 first, last = _group(rays, steep, v, axis, last)
         for col in range(cols):
             out[v, col] = lanes.total(lanes.load(total, col, 0)) * _f(rays[v, col, 4])
@@ -134,28 +135,29 @@ def _adjoint(
         for v in range(views):
             first, last = _group(rays, steep, v, axis, 0)
             while first < last:
-                _lean(rays, v, first, last, shifts, offsets)
+                _shifts_of_lines(rays, v, first, last, shifts, offsets)
                 low, high = _crossing(rays, v, first, last, j, n)
                 if high > low:
-                    one, other = _row(rays, v, low, j)[0], _row(rays, v, high - 1, j)[0]
-                    top, bottom = min(one, other) - 1, max(one, other) + 5  # see _row
+                    row_low = _row_and_distance(rays, v, low, j)[0]
+                    row_high = _row_and_distance(rays, v, high - 1, j)[0]
+                    top, bottom = min(row_low, row_high) - 1, max(row_low, row_high) + 5  # see _row_and_distance
                     count = (bottom - top + _BAND - 1) // _BAND * _BAND
                     band[:count] = _f(0)
                     offset = lanes.load(offsets, 0, 0)
                     for col in range(low, high):
-                        row, far = _row(rays, v, col, j)
+                        row, distance = _row_and_distance(rays, v, col, j)
                         row -= top
-                        at = lanes.iota() * _f(rays[v, col, 1]) + offset + far
+                        position = lanes.iota() * _f(rays[v, col, 1]) + offset + distance
                         ray = projections[v, col] * _f(rays[v, col, 4])
-                        b = lanes.clamp(at, _f(0), _f(1)) * ray
-                        c = lanes.clamp(at - _f(1), _f(0), _f(1)) * ray
-                        d = lanes.clamp(at - _f(2), _f(0), _f(1)) * ray
+                        b = lanes.clamp(position, _f(0), _f(1)) * ray
+                        c = lanes.clamp(position - _f(1), _f(0), _f(1)) * ray
+                        d = lanes.clamp(position - _f(2), _f(0), _f(1)) * ray
                         lanes.store(band, row, 0, lanes.load(band, row, 0) + (ray - b))
                         lanes.store(band, row + 1, 0, lanes.load(band, row + 1, 0) + (b - c))
                         lanes.store(band, row + 2, 0, lanes.load(band, row + 2, 0) + (c - d))
                         lanes.store(band, row + 3, 0, lanes.load(band, row + 3, 0) + d)
                     for row in range(0, count, _BAND):
-                        lanes.add_turned(lines, j, _BEFORE + top + row, shifts, band, row)
+                        lanes.add_transposed(lines, j, _BEFORE + top + row, shifts, band, row)
                 first, last = _group(rays, steep, v, axis, last)
 
 
@@ -168,11 +170,11 @@ def _pad(image: F32, ys: F32, xs: F32) -> None:
         if y < ny:
             ys[y, _BEFORE : _BEFORE + nx] = image[y]
     for band in prange(len(xs) // _BAND):
-        x, straight = band * _BAND, np.zeros(_BAND, np.intp)
+        x, no_shifts = band * _BAND, np.zeros(_BAND, np.intp)
         tile = np.empty((_BAND, _BAND), np.float32)
         xs[x : x + _BAND] = _f(0)
         for y in range(0, len(ys), _BAND):
-            lanes.load_turned(ys, y, _BEFORE + x, straight, tile, 0)
+            lanes.load_transposed(ys, y, _BEFORE + x, no_shifts, tile, 0)
             for k in range(_BAND):
                 lanes.store(xs, x + k, _BEFORE + y, lanes.load(tile, k, 0))
 
@@ -182,13 +184,13 @@ def _join(ys: F32, xs: F32, out: F32) -> None:
     """out [y, x]: the sum of padded lines along x and along y."""
     ny, nx = out.shape
     for band in prange(len(ys) // _BAND):
-        y, straight = band * _BAND, np.zeros(_BAND, np.intp)
+        y, no_shifts = band * _BAND, np.zeros(_BAND, np.intp)
         tile = np.empty((_BAND, _BAND), np.float32)
         for x in range(0, nx, _BAND):
-            lanes.load_turned(xs, x, _BEFORE + y, straight, tile, 0)
+            lanes.load_transposed(xs, x, _BEFORE + y, no_shifts, tile, 0)
             for k in range(min(_BAND, ny - y)):
-                both = lanes.load(ys, y + k, _BEFORE + x) + lanes.load(tile, k, 0)
-                lanes.store_first(out, y + k, x, both, min(_BAND, nx - x))
+                sum_of_both = lanes.load(ys, y + k, _BEFORE + x) + lanes.load(tile, k, 0)
+                lanes.store_first(out, y + k, x, sum_of_both, min(_BAND, nx - x))
 
 
 def forward(image: F32, rays: F64, steep: Flags, out: F32) -> None:

@@ -33,11 +33,11 @@ class PatchScratch(NamedTuple):
     """Memory for the volume extended beyond its faces, and for sums of blocks; see `patch_scratch`.
 
     Attributes:
-        given, sums: [a + 6, plane], planes of (b + 6) lines and room for the last vector.
+        extended, sums: [a + 6, plane], planes of (b + 6) lines and room for the last vector.
         share: [1, plane], weight of a block at each position: 1 / 64 (1 / 16 for a flat block), or 0.
     """
 
-    given: F32
+    extended: F32
     sums: F32
     share: F32
 
@@ -55,7 +55,7 @@ def _cosines(p, base, step):
 
 
 @njit(inline="always", fastmath=True)
-def _values(p, base, step):
+def _inverse_cosines(p, base, step):
     """The inverse of `_cosines`."""
     a, b = lanes.load(p, base, 0) * _HALF, lanes.load(p, base + step, 0)
     c, d = lanes.load(p, base + 2 * step, 0) * _HALF, lanes.load(p, base + 3 * step, 0)
@@ -67,13 +67,16 @@ def _values(p, base, step):
 
 
 @njit(inline="always", fastmath=True)
-def _shrink(found, sums, size, plane, threshold):
-    """Adds the blocks whose first plane is `plane`, `found` [4 size, 16], to `sums`. Both use the plane modulo 4."""
+def _shrink(coefficients, sums, size, plane, threshold):
+    """Adds the blocks whose first plane is `plane`, `coefficients` [4 size, 16], to `sums`.
+
+    Both use the plane modulo 4.
+    """
     p0, p1, p2, p3 = (plane & 3) * size, (plane + 1 & 3) * size, (plane + 2 & 3) * size, (plane + 3 & 3) * size
     for m in range(size):
         a, b, c, d = (
-            lanes.load(found, p0 + m, 0), lanes.load(found, p1 + m, 0),
-            lanes.load(found, p2 + m, 0), lanes.load(found, p3 + m, 0),
+            lanes.load(coefficients, p0 + m, 0), lanes.load(coefficients, p1 + m, 0),
+            lanes.load(coefficients, p2 + m, 0), lanes.load(coefficients, p3 + m, 0),
         )  # fmt: skip
         outer, inner, wide, near = a + d, b + c, a - d, b - c
         mean = (outer + inner) * _HALF
@@ -91,11 +94,11 @@ def _shrink(found, sums, size, plane, threshold):
 
 
 @njit(fastmath=True, error_model="numpy", cache=True)
-def _column(given, out, share, first, end, at, line, depth, threshold, found, sums):
-    """Sixteen columns of blocks, with first voxels in planes `first` to `end`; `at`: position of the first column in a
-    plane."""
+def _column(extended, out, share, first, end, position, line, depth, threshold, coefficients, sums):
+    """Sixteen columns of blocks, with first voxels in planes `first` to `end`; `position`: place of the first
+    column in a plane."""
     size = EDGE * depth
-    counts = lanes.load(share, 0, at)
+    weights = lanes.load(share, 0, position)
     for m in range(EDGE * size):
         lanes.store(sums, m, 0, lanes.zero())
     for plane in range(first, end + 2 * _BEYOND):
@@ -103,45 +106,51 @@ def _column(given, out, share, first, end, at, line, depth, threshold, found, su
         if plane < end + _BEYOND:
             for j in range(EDGE):
                 for k in range(depth):
-                    lanes.store(found, slot + j * depth + k, 0, lanes.load(given, plane, at + j * line + k))
+                    lanes.store(
+                        coefficients, slot + j * depth + k, 0, lanes.load(extended, plane, position + j * line + k)
+                    )
             if depth > 1:
                 for j in range(EDGE):
-                    _cosines(found, slot + j * depth, 1)
+                    _cosines(coefficients, slot + j * depth, 1)
             for k in range(depth):
-                _cosines(found, slot + k, depth)
-        done = plane - _BEYOND
-        if done < first:
+                _cosines(coefficients, slot + k, depth)
+        finished = plane - _BEYOND
+        if finished < first:
             continue
-        if done < end:
-            _shrink(found, sums, size, done, threshold)
-        slot = (done & 3) * size
+        if finished < end:
+            _shrink(coefficients, sums, size, finished, threshold)
+        slot = (finished & 3) * size
         for k in range(depth):
-            _values(sums, slot + k, depth)
+            _inverse_cosines(sums, slot + k, depth)
         if depth > 1:
             for j in range(EDGE):
-                _values(sums, slot + j * depth, 1)
+                _inverse_cosines(sums, slot + j * depth, 1)
         # The last voxel of a block comes first, so that a voxel sums its blocks in the same order, whatever the first
         # voxel of a vector.
         for j in range(EDGE - 1, -1, -1):
             for k in range(depth - 1, -1, -1):
-                to, row = at + j * line + k, slot + j * depth + k
-                lanes.store(out, done, to, lanes.load(out, done, to) + lanes.load(sums, row, 0) * counts)
+                target, row = position + j * line + k, slot + j * depth + k
+                lanes.store(
+                    out, finished, target, lanes.load(out, finished, target) + lanes.load(sums, row, 0) * weights
+                )
                 lanes.store(sums, row, 0, lanes.zero())
 
 
 @njit(**OPTIONS)
 def _denoise(
-    given: F32, sums: F32, share: F32, blocks: int, line: int, depth: int, threshold: float, step: int
+    extended: F32, sums: F32, share: F32, blocks: int, line: int, depth: int, threshold: float, step: int
 ) -> None:
-    planes, size = given.shape[0] - _BEYOND, EDGE * EDGE * depth
+    planes, size = extended.shape[0] - _BEYOND, EDGE * EDGE * depth
     tasks = -(-planes // step)
-    for odd in range(2):  # neighbouring tasks add to the same planes
-        for half in prange((tasks + 1 - odd) // 2):
-            first = (2 * half + odd) * step
+    for parity in range(2):  # neighbouring tasks add to the same planes
+        for half in prange((tasks + 1 - parity) // 2):
+            first = (2 * half + parity) * step
             end = min(first + step, planes)
-            found, added = np.empty((size, 16), np.float32), np.empty((size, 16), np.float32)
-            for at in range(0, blocks, 16):
-                _column(given, sums, share, first, end, at, line, depth, _f(threshold), found, added)
+            coefficients, block_sums = np.empty((size, 16), np.float32), np.empty((size, 16), np.float32)
+            for position in range(0, blocks, 16):
+                _column(
+                    extended, sums, share, first, end, position, line, depth, _f(threshold), coefficients, block_sums
+                )
 
 
 @njit(inline="always")
@@ -151,14 +160,14 @@ def _mirrored(i, n):
 
 
 @njit(**OPTIONS)
-def _pad(x: F32, beyond: int, given: F32, sums: F32) -> None:
+def _pad(x: F32, beyond: int, extended: F32, sums: F32) -> None:
     na, nb, nc = x.shape
     line = nc + 2 * beyond
     for p in prange(na + 2 * _BEYOND):
         sums[p] = _f(0)
         i = _mirrored(p - _BEYOND, na)
         for q in range(nb + 2 * _BEYOND):
-            source, target = x[i, _mirrored(q - _BEYOND, nb)], given[p, q * line : (q + 1) * line]
+            source, target = x[i, _mirrored(q - _BEYOND, nb)], extended[p, q * line : (q + 1) * line]
             for k in range(nc):
                 target[beyond + k] = source[k]
             for k in range(beyond):
@@ -166,7 +175,7 @@ def _pad(x: F32, beyond: int, given: F32, sums: F32) -> None:
 
 
 @njit(**OPTIONS)
-def _inner(sums: F32, beyond: int, floor: float, out: F32) -> None:
+def _crop(sums: F32, beyond: int, floor: float, out: F32) -> None:
     na, nb, nc = out.shape
     line, low = nc + 2 * beyond, _f(floor)
     for i in prange(na):
@@ -182,21 +191,21 @@ def patch_scratch(shape: tuple[int, int, int]) -> PatchScratch:
     na, nb, nc = shape
     depth, beyond = _depth(nc)
     line = nc + 2 * beyond
-    blocks = _whole((nb + _BEYOND) * line)
+    blocks = _rounded_up((nb + _BEYOND) * line)
     size = blocks + _BEYOND * line + 16
-    share = np.zeros((nb + 2 * _BEYOND, line), np.float32)
-    share[: nb + _BEYOND, : nc + beyond] = 1 / (EDGE**2 * depth)
-    every = np.zeros((1, size), np.float32)
-    every[0, : share.size] = share.ravel()
-    given, sums = (np.zeros((na + 2 * _BEYOND, size), np.float32) for _ in range(2))
-    return PatchScratch(given, sums, every)
+    weights_of_plane = np.zeros((nb + 2 * _BEYOND, line), np.float32)
+    weights_of_plane[: nb + _BEYOND, : nc + beyond] = 1 / (EDGE**2 * depth)
+    weights = np.zeros((1, size), np.float32)
+    weights[0, : weights_of_plane.size] = weights_of_plane.ravel()
+    extended, sums = (np.zeros((na + 2 * _BEYOND, size), np.float32) for _ in range(2))
+    return PatchScratch(extended, sums, weights)
 
 
 def scratch_values(shape: tuple[int, int, int]) -> int:
     """Number of values in `patch_scratch`."""
     na, nb, nc = shape
     line = nc + 2 * _depth(nc)[1]
-    return (2 * (na + 2 * _BEYOND) + 1) * (_whole((nb + _BEYOND) * line) + _BEYOND * line + 16)
+    return (2 * (na + 2 * _BEYOND) + 1) * (_rounded_up((nb + _BEYOND) * line) + _BEYOND * line + 16)
 
 
 def _depth(nc: int) -> tuple[int, int]:
@@ -204,7 +213,7 @@ def _depth(nc: int) -> tuple[int, int]:
     return (EDGE, _BEYOND) if nc >= EDGE else (1, 0)
 
 
-def _whole(values: int) -> int:
+def _rounded_up(values: int) -> int:
     return -(-values // 16) * 16
 
 
@@ -221,26 +230,28 @@ def denoise(x: F32, threshold: float, nonnegative: bool, scratch: PatchScratch, 
     na, nb, nc = x.shape
     depth, beyond = _depth(nc)
     line = nc + 2 * beyond
-    _pad(x, beyond, scratch.given, scratch.sums)
+    _pad(x, beyond, scratch.extended, scratch.sums)
     step = min(max(na // _TASKS, _LEAST), _MOST)
     _denoise(*scratch, (nb + _BEYOND) * line, line, depth, threshold, step)
-    _inner(scratch.sums, beyond, 0.0 if nonnegative else float(np.finfo(np.float32).min), out)
+    _crop(scratch.sums, beyond, 0.0 if nonnegative else float(np.finfo(np.float32).min), out)
 
 
 @njit(**OPTIONS)
 def _pulled_step(
-    x: F32, change: F32, momentum: float, pace: float, gradient: F32, pull: float, z: F32, floor: float
+    x: F32, change: F32, momentum: float, step_size: float, gradient: F32, pull: float, z: F32, floor: float
 ) -> None:  # fmt: skip
-    p, q, m, low = _f(momentum), _f(pace), _f(pull), _f(floor)
+    p, q, m, low = _f(momentum), _f(step_size), _f(pull), _f(floor)
     for i in prange(x.size):
-        here = x[i]
-        x[i] = max(here + p * change[i] + q * (gradient[i] + m * (z[i] - here)), low)
-        change[i] = x[i] - here
+        value = x[i]
+        x[i] = max(value + p * change[i] + q * (gradient[i] + m * (z[i] - value)), low)
+        change[i] = x[i] - value
 
 
 def pulled_step(
-    x: F32, change: F32, momentum: float, pace: float, gradient: F32, pull: float, z: F32, nonnegative: bool
+    x: F32, change: F32, momentum: float, step_size: float, gradient: F32, pull: float, z: F32, nonnegative: bool
 ) -> None:  # fmt: skip
-    """change = momentum change + pace (gradient + pull (z - x)), and x += change, at least 0 with `nonnegative`."""
+    """change = momentum change + step_size (gradient + pull (z - x)), x += change, at least 0 with `nonnegative`."""
     floor = 0.0 if nonnegative else float(np.finfo(np.float32).min)
-    _pulled_step(x.reshape(-1), change.reshape(-1), momentum, pace, gradient.reshape(-1), pull, z.reshape(-1), floor)
+    _pulled_step(
+        x.reshape(-1), change.reshape(-1), momentum, step_size, gradient.reshape(-1), pull, z.reshape(-1), floor
+    )

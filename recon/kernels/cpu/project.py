@@ -51,7 +51,7 @@ _COMPACT_SLOPE = np.float32(2 * Kernel.COMPACT.exponent / Kernel.COMPACT.radius*
 
 
 @njit(inline="always", fastmath=True)
-def _start(table, i, dx, dy):
+def _start_gaussian(table, i, dx, dy):
     """G, Q and q of a row, for the lanes at column offsets dx."""
     k, shear, kv = _f(-0.5) * table[i, K], table[i, SHEAR], _f(-0.5) * table[i, KV]
     across = dx - shear * dy
@@ -78,7 +78,7 @@ def _start_compact(table, i, dx, dy):
 
 
 @njit(inline="always", fastmath=True)
-def _at(table, i, first, dy, profile):
+def _values_at(table, i, first, dy, profile):
     """τ of the lanes from `first` on, and G and D there (D of a compact kernel without its factor)."""
     dx = lanes.iota() + (_f(first) - table[i, U])
     across = dx - table[i, SHEAR] * dy
@@ -98,7 +98,7 @@ def _add_by_pixels(table, i, row0, row1, col0, col1, image, profile):
         low, high = span_of(table, i, dy, col0, col1)
         for start in range(low, high, lanes.WIDTH):
             first = min(start, image.shape[1] - lanes.WIDTH)
-            _, value, _ = _at(table, i, first, dy, profile)
+            _, value, _ = _values_at(table, i, first, dy, profile)
             value = lanes.between(value * table[i, W], start - first, high - first)
             lanes.store(image, row, first, lanes.load(image, row, first) + value)
 
@@ -126,12 +126,12 @@ def _gather_by_pixels(table, i, row0, row1, col0, col1, gradient, moments, profi
         low, high = span_of(table, i, dy, col0, col1)
         for start in range(low, high, lanes.WIDTH):
             first = min(start, gradient.shape[1] - lanes.WIDTH)
-            across, value, slope = _at(table, i, first, dy, profile)
-            under = lanes.between(lanes.load(gradient, row, first), start - first, high - first)
-            here = under * slope
-            aside, rise = here * across, here * dy
-            m0, d0, mt, mv = m0 + under * value, d0 + here, mt + aside, mv + rise
-            mtt, mtv, mvv = mtt + aside * across, mtv + aside * dy, mvv + rise * dy
+            across, value, slope = _values_at(table, i, first, dy, profile)
+            pixel_gradient = lanes.between(lanes.load(gradient, row, first), start - first, high - first)
+            weighted = pixel_gradient * slope
+            weighted_across, weighted_down = weighted * across, weighted * dy
+            m0, d0, mt, mv = m0 + pixel_gradient * value, d0 + weighted, mt + weighted_across, mv + weighted_down
+            mtt, mtv, mvv = mtt + weighted_across * across, mtv + weighted_across * dy, mvv + weighted_down * dy
     _store(moments, i, m0, d0, mt, mv, mtt, mtv, mvv, profile)
 
 
@@ -140,7 +140,7 @@ def _add_gaussian(table, i, first, low, high, row0, row1, image):
     """Add the lanes low, ..., high - 1 from column `first` on, by the recurrence."""
     dx = lanes.iota() + (_f(first) - table[i, U])
     for anchor in range(row0, row1, ANCHOR):
-        value, factor, change = _start(table, i, dx, _f(anchor) - table[i, V])
+        value, factor, change = _start_gaussian(table, i, dx, _f(anchor) - table[i, V])
         value = lanes.between(value * table[i, W], low, high)
         for group in range(anchor, min(row1, anchor + ANCHOR), GROUP):
             for step in range(GROUP):
@@ -188,14 +188,14 @@ def _column_gaussian(table, i, dx, first, low, high, row0, row1, gradient):
     """Σ g G, and Σ g D times 1, δv, δv² over the rows, for the lanes low, ..., high - 1, by the recurrence."""
     s0, s1, s2 = lanes.zero(), lanes.zero(), lanes.zero()
     for anchor in range(row0, row1, ANCHOR):
-        value, factor, change = _start(table, i, dx, _f(anchor) - table[i, V])
+        value, factor, change = _start_gaussian(table, i, dx, _f(anchor) - table[i, V])
         value = lanes.between(value, low, high)
         for group in range(anchor, min(row1, anchor + ANCHOR), GROUP):
             dy = _f(group) - table[i, V]
             for step in range(GROUP):
-                here = lanes.load(gradient, group + step, first) * value
-                rise = here * (dy + _f(step))
-                s0, s1, s2 = s0 + here, s1 + rise, s2 + rise * (dy + _f(step))
+                weighted = lanes.load(gradient, group + step, first) * value
+                weighted_down = weighted * (dy + _f(step))
+                s0, s1, s2 = s0 + weighted, s1 + weighted_down, s2 + weighted_down * (dy + _f(step))
                 value = value * factor
                 factor = factor * change
     return s0, s0, s1, s2
@@ -211,9 +211,10 @@ def _column_compact(table, i, dx, first, low, high, row0, row1, gradient, profil
             dy = _f(group) - table[i, V]
             for step in range(GROUP):
                 value, slope = _compact(t, profile)
-                here = lanes.load(gradient, group + step, first) * slope
-                rise = here * (dy + _f(step))
-                m0, s0, s1, s2 = m0 + here * value, s0 + here, s1 + rise, s2 + rise * (dy + _f(step))
+                weighted = lanes.load(gradient, group + step, first) * slope
+                weighted_down = weighted * (dy + _f(step))
+                m0, s0, s1 = m0 + weighted * value, s0 + weighted, s1 + weighted_down
+                s2 = s2 + weighted_down * (dy + _f(step))
                 t = t + change
                 change = change + bend
     return (
@@ -250,12 +251,12 @@ def gather_footprint(table, i, rows, cols, gradient, moments, profile):
 
 
 @njit(inline="always", fastmath=True)
-def _join(fresh, image, row0, row1):
-    """Add rows of `fresh` to the image and set them to zero."""
+def _add_and_clear(partial_sum, image, row0, row1):
+    """Add rows of `partial_sum` to the image and set them to zero."""
     for row in range(row0, row1):
         for col in range(image.shape[1]):
-            image[row, col] += fresh[row, col]
-            fresh[row, col] = _f(0)
+            image[row, col] += partial_sum[row, col]
+            partial_sum[row, col] = _f(0)
 
 
 # The profile is a constant of the compiled kernels, so that the other profiles cost a Gaussian nothing.
@@ -263,19 +264,19 @@ def _renderer(profile: int | None) -> Any:
     @njit(**OPTIONS)
     def kernel(table: F32, rows: int, cols: int, layers: F32) -> None:
         n, threads = table.shape[0], layers.shape[0] // 2
-        share = (n + threads - 1) // threads
-        for t in prange(threads):
-            image, fresh = layers[t], layers[threads + t]
+        n_of_thread = (n + threads - 1) // threads
+        for thread in prange(threads):
+            image, partial_sum = layers[thread], layers[threads + thread]
             image[:] = _f(0)
-            fresh[:] = _f(0)
-            end = min(n, (t + 1) * share)
-            for start in range(t * share, end, MANY):
+            partial_sum[:] = _f(0)
+            end = min(n, (thread + 1) * n_of_thread)
+            for start in range(thread * n_of_thread, end, MANY):
                 row0, row1 = layers.shape[1], 0
                 for i in range(start, min(end, start + MANY)):
-                    first, last = add_footprint(table, i, rows, cols, fresh, profile)
+                    first, last = add_footprint(table, i, rows, cols, partial_sum, profile)
                     if last > first:
                         row0, row1 = min(row0, first), max(row1, last)
-                _join(fresh, image, row0, row1)
+                _add_and_clear(partial_sum, image, row0, row1)
 
     return kernel
 
@@ -323,6 +324,6 @@ def moments(table: F32, gradient: F32, result: F32 | None = None, kernel: Kernel
     The gradient is copied unless it is C-contiguous and has its `padded_shape`.
     """
     rows, cols = gradient.shape
-    found = np.empty((table.shape[0], 6), np.float32) if result is None else result
-    _MOMENTS[kernel](table, padded(gradient), rows, cols, found)
-    return found
+    filled = np.empty((table.shape[0], 6), np.float32) if result is None else result
+    _MOMENTS[kernel](table, padded(gradient), rows, cols, filled)
+    return filled

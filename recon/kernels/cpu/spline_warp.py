@@ -21,7 +21,7 @@ _SIXTH = _f(1 / 6)
 
 
 @njit(inline="always")
-def _taps(at, size, index, share, slope):
+def _taps(position, size, index, share, slope):
     """Numbers, shares and derivatives of the shares of the four coefficients around a place (of one coefficient if size
     is 1)."""
     for e in range(4):
@@ -29,9 +29,9 @@ def _taps(at, size, index, share, slope):
     if size == 1:
         share[0] = _f(1)
         return
-    inside = min(max(at, _f(0)), _f(size - 1))
-    low = min(math.floor(inside), size - 2)
-    t = inside - _f(low)
+    clipped = min(max(position, _f(0)), _f(size - 1))
+    low = min(math.floor(clipped), size - 2)
+    t = clipped - _f(low)
     s = _f(1) - t
     for e in range(4):
         n = abs(low - 1 + e)
@@ -39,7 +39,7 @@ def _taps(at, size, index, share, slope):
     share[0], share[3] = s * s * s * _SIXTH, t * t * t * _SIXTH
     share[1] = (_f(4) - _f(6) * t * t + _f(3) * t * t * t) * _SIXTH
     share[2] = (_f(4) - _f(6) * s * s + _f(3) * s * s * s) * _SIXTH
-    if inside == at:
+    if clipped == position:
         slope[0], slope[3] = -_f(0.5) * s * s, _f(0.5) * t * t
         slope[1], slope[2] = (_f(1.5) * t - _f(2)) * t, (_f(2) - _f(1.5) * s) * s
 
@@ -47,7 +47,7 @@ def _taps(at, size, index, share, slope):
 @njit(**OPTIONS)
 def _pull(c: F32, u: F32, first: NDArray[np.int64], out: F32, slopes: F32) -> None:
     _, ny, nx, nz = u.shape
-    wanted = slopes.size > 0
+    with_slopes = slopes.size > 0
     for j in prange(ny):
         index, share, slope = np.zeros((3, 4), np.int64), np.zeros((3, 4), np.float32), np.zeros((3, 4), np.float32)
         for i in range(nx):
@@ -59,16 +59,16 @@ def _pull(c: F32, u: F32, first: NDArray[np.int64], out: F32, slopes: F32) -> No
                 for p in range(4):
                     for q in range(4):
                         row = c[index[0, p], index[1, q]]
-                        own, along = _f(0), _f(0)
+                        value_z, slope_z = _f(0), _f(0)
                         for r in range(4):
-                            own += share[2, r] * row[index[2, r]]
-                            along += slope[2, r] * row[index[2, r]]
-                        value += share[0, p] * share[1, q] * own
-                        gy += slope[0, p] * share[1, q] * own
-                        gx += share[0, p] * slope[1, q] * own
-                        gz += share[0, p] * share[1, q] * along
+                            value_z += share[2, r] * row[index[2, r]]
+                            slope_z += slope[2, r] * row[index[2, r]]
+                        value += share[0, p] * share[1, q] * value_z
+                        gy += slope[0, p] * share[1, q] * value_z
+                        gx += share[0, p] * slope[1, q] * value_z
+                        gz += share[0, p] * share[1, q] * slope_z
                 out[j, i, k] = value
-                if wanted:
+                if with_slopes:
                     slopes[0, j, i, k], slopes[1, j, i, k], slopes[2, j, i, k] = gy, gx, gz
 
 
@@ -79,8 +79,8 @@ def pull(c: F32, u: F32, first: tuple[int, int, int], out: F32, slopes: F32 | No
         c: coefficients [y, x, z] of any shape, see `coefficients`.
         first: the voxel of c at which voxel 0 of `out` lies without a displacement.
     """
-    none = np.empty((3, 0, 0, 0), np.float32)
-    _pull(c, u, np.asarray(first, np.int64), out, none if slopes is None else slopes)
+    no_slopes = np.empty((3, 0, 0, 0), np.float32)
+    _pull(c, u, np.asarray(first, np.int64), out, no_slopes if slopes is None else slopes)
 
 
 def coefficients(x: F32) -> F32:

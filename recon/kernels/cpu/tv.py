@@ -96,13 +96,13 @@ def _dual_plane(pa, pb, pc, v, pair, nc, near, far, here, back1, s0, s1, s2):
 
 @njit(**OPTIONS)
 def _dual_step(
-    x: F32, pa: F32, pb: F32, pc: F32, nc: int, threshold: float, pace: float, weights: Weights, floor: float,
+    x: F32, pa: F32, pb: F32, pc: F32, nc: int, threshold: float, step_size: float, weights: Weights, floor: float,
     back0: int, back1: int, edges: F32, planes: F32, zero: F32,
 ) -> None:  # fmt: skip
     na, runs = x.shape[0], edges.shape[0]
     w0, w1, w2 = _f(weights[0]), _f(weights[1]), _f(weights[2])
-    s0, s1 = _f(pace) * w0, _f(pace) * w1
-    s2 = np.full(max(1, _PIECE // nc) * nc, _f(pace) * w2)
+    s0, s1 = _f(step_size) * w0, _f(step_size) * w1
+    s2 = np.full(max(1, _PIECE // nc) * nc, _f(step_size) * w2)
     s2[nc - 1 :: nc] = _f(0)
     # Compute the first plane of each run, before another thread changes the dual fields on which this plane depends.
     for run in prange(runs):
@@ -142,7 +142,7 @@ def _primal(
                 target[k] = plane[k]
 
 
-def dual_pace(threshold: float, weights: Weights) -> float:
+def dual_step_size(threshold: float, weights: Weights) -> float:
     """The length of a dual step: 0.75 of the longest step that converges by itself, see `dual_step`."""
     return min(1.5 / (4 * sum(w * w for w in weights)) / threshold, _FASTEST)
 
@@ -151,7 +151,8 @@ def dual_step(
     x: F32, p: DualField, threshold: float, weights: Weights, nonnegative: bool, scratch: DualScratch,
     back: tuple[int, int] = (0, 0),
 ) -> None:  # fmt: skip
-    """p <- projection onto |p| <= 1 of p + pace D P(x - threshold Dᵀ p), in place; P clips negative values or none.
+    """p <- projection onto |p| <= 1 of p + step_size D P(x - threshold Dᵀ p), in place; P clips negative values or
+    none.
 
     Projected gradient ascent of the dual of min ½|y - x|² + threshold TV(y) (Chambolle 2004; with P: Beck & Teboulle
     2009, eq. 4.6), at 0.75 of the longest step that converges by itself. With longer steps, the sign of the finest
@@ -162,9 +163,9 @@ def dual_step(
         back: for the first two axes, 1: |p| of a voxel uses the difference from the previous voxel; 0: the difference
             to the next voxel. This is total variation in a mirror image.
     """
-    pace = dual_pace(threshold, weights)
+    step_size = dual_step_size(threshold, weights)
     floor = 0.0 if nonnegative else _NO_FLOOR
-    _dual_step(*_in_planes(x, *p), x.shape[2], threshold, pace, weights, floor, *back, *scratch)
+    _dual_step(*_in_planes(x, *p), x.shape[2], threshold, step_size, weights, floor, *back, *scratch)
 
 
 def primal(

@@ -32,10 +32,10 @@ def _rise(p0, p1, p2, here, below, right, after, bound, s0, s1, s2):
 
 
 @njit(**OPTIONS)
-def _ascend(x: F32, bound: F32, nz: int, pace: float, weights: Weights, p: F32) -> None:
+def _ascend(x: F32, bound: F32, nz: int, step_size: float, weights: Weights, p: F32) -> None:
     ny, n = x.shape
-    t0, t1 = _f(pace * weights[0]), _f(pace * weights[1])
-    along = np.full(n, _f(pace * weights[2]))
+    t0, t1 = _f(step_size * weights[0]), _f(step_size * weights[1])
+    along = np.full(n, _f(step_size * weights[2]))
     along[nz - 1 :: nz] = _f(0)
     for j in prange(ny):
         here, below, b = x[j], x[min(j + 1, ny - 1)], bound[j]
@@ -98,10 +98,10 @@ def primal(
     _primal(z.reshape(planes), p, q, m.reshape(planes), z.shape[2], threshold, weights, floor, zero, x, beside)
 
 
-def ascend(x: F32, bound: F32, pace: float, weights: Weights, p: F32) -> None:
-    """p <- p + pace D x, in place, each vector shortened to the length bound_i."""
+def ascend(x: F32, bound: F32, step_size: float, weights: Weights, p: F32) -> None:
+    """p <- p + step_size D x, in place, each vector shortened to the length bound_i."""
     planes = (len(x), -1)
-    _ascend(x.reshape(planes), bound.reshape(planes), x.shape[2], pace, weights, p.reshape(3, len(x), -1))
+    _ascend(x.reshape(planes), bound.reshape(planes), x.shape[2], step_size, weights, p.reshape(3, len(x), -1))
 
 
 def pace_of(threshold: float, weights: Weights) -> float:

@@ -53,10 +53,10 @@ _SLOPE = 8  # in a piece: the weight of D in a slice of a compact kernel
 
 @njit(**OPTIONS)
 def _near(
-    means: F32, scales: F32, low: NDArray[np.float64], high: NDArray[np.float64], cut: float, found: NDArray[np.int64],
-    counts: NDArray[np.int64],
+    means: F32, scales: F32, low: NDArray[np.float64], high: NDArray[np.float64], cut: float,
+    indices: NDArray[np.int64], counts: NDArray[np.int64],
 ) -> None:  # fmt: skip
-    """Gaussians whose bounding sphere meets the box low..high; each task fills its piece of `found`."""
+    """Gaussians whose bounding sphere meets the box low..high; each task fills its piece of `indices`."""
     n = means.shape[0]
     x0, y0, z0 = _f(low[0]), _f(low[1]), _f(low[2])
     x1, y1, z1 = _f(high[0]), _f(high[1]), _f(high[2])
@@ -66,9 +66,9 @@ def _near(
         for i in range(begin, min(n, begin + _TASK)):
             reach = _f(cut) * max(scales[i, 0], scales[i, 1], scales[i, 2])
             x, y, z = means[i, 0], means[i, 1], means[i, 2]
-            across = (x + reach >= x0) & (x - reach <= x1) & (y + reach >= y0) & (y - reach <= y1)
-            found[k] = i  # the next Gaussian overwrites this entry if this one is outside, so no branch is needed
-            k += across & (z + reach >= z0) & (z - reach <= z1)
+            overlaps_xy = (x + reach >= x0) & (x - reach <= x1) & (y + reach >= y0) & (y - reach <= y1)
+            indices[k] = i  # the next Gaussian overwrites this entry if this one is outside, so no branch is needed
+            k += overlaps_xy & (z + reach >= z0) & (z - reach <= z1)
         counts[task] = k - begin
 
 
@@ -136,11 +136,11 @@ def _place(
 
 
 @njit(inline="always", fastmath=True)
-def _cut(table, j, z, weight, piece, profile):
+def _slice_footprint(table, j, z, weight, piece, profile):
     """Slice z of Gaussian j as a footprint, piece [1, 9 or more]; returns δz."""
     dz = _f(z) - table[j, _Z]
-    down = table[j, _KZ] * dz * dz
-    reach = np.sqrt(max(table[j, _REACH] * table[j, _REACH] - down, _f(0)))
+    square_z = table[j, _KZ] * dz * dz
+    reach = np.sqrt(max(table[j, _REACH] * table[j, _REACH] - square_z, _f(0)))
     piece[0, U] = table[j, _X] + table[j, _DRIFT_X] * dz
     piece[0, V] = table[j, _Y] + table[j, _DRIFT_Y] * dz
     piece[0, HU], piece[0, HV] = reach * table[j, _WIDE_X], reach * table[j, _WIDE_Y]
@@ -148,12 +148,12 @@ def _cut(table, j, z, weight, piece, profile):
     if profile is None:
         piece[0, K], piece[0, KV] = table[j, K], table[j, KV]
         # numba's own exp is a call that clears the vector registers.
-        piece[0, W] = weight * lanes.lowest(lanes.exp(lanes.zero() + _f(-0.5) * down))
+        piece[0, W] = weight * lanes.lowest(lanes.exp(lanes.zero() + _f(-0.5) * square_z))
     else:
-        left = max(_f(1) - _PER * down, _f(1e-7))
-        piece[0, K], piece[0, KV] = table[j, K] / left, table[j, KV] / left
-        piece[0, _SLOPE] = weight * np.sqrt(left)
-        piece[0, W] = left * piece[0, _SLOPE]
+        remaining = max(_f(1) - _PER * square_z, _f(1e-7))
+        piece[0, K], piece[0, KV] = table[j, K] / remaining, table[j, KV] / remaining
+        piece[0, _SLOPE] = weight * np.sqrt(remaining)
+        piece[0, W] = remaining * piece[0, _SLOPE]
     return dz
 
 
@@ -181,7 +181,7 @@ def _filler(profile: int | None) -> Any:
             volume[low:high] = _f(0)
             for j in range(hits.shape[0]):
                 for z in range(max(low, slices[j, 0]), min(high, slices[j, 1])):
-                    _cut(table, j, z, densities[hits[j]], piece, profile)
+                    _slice_footprint(table, j, z, densities[hits[j]], piece, profile)
                     _add_footprint(piece, 0, ny, nx, volume[z], profile)
 
     return kernel
@@ -209,22 +209,23 @@ def _gatherer(profile: int | None) -> Any:
     ) -> None:
         ex, ez = _f(spacing[2]), _f(spacing[0])
         for task in prange(pieces.shape[0]):
-            piece, found = pieces[task, :1], pieces[task, 1:]
+            piece, slice_moments = pieces[task, :1], pieces[task, 1:]
             for j in range(task * _SHARE, min(hits.shape[0], (task + 1) * _SHARE)):
                 i = hits[j]
                 n0 = nt = nv = nz = tt = tv = vv = tz = vz = zz = _f(0)
                 for z in range(slices[j, 0], slices[j, 1]):
-                    dz = _cut(table, j, z, _f(1), piece, profile)
-                    _gather_footprint(piece, 0, ny, nx, gradient[z], found, profile)
+                    dz = _slice_footprint(table, j, z, _f(1), piece, profile)
+                    _gather_footprint(piece, 0, ny, nx, gradient[z], slice_moments, profile)
                     weight = piece[0, W]
-                    m0 = weight * found[0, 0]
+                    m0 = weight * slice_moments[0, 0]
                     n0 += m0
                     if profile is not None:
                         weight = piece[0, _SLOPE]
-                        m0 = weight * found[0, 6]
-                    mt, mv = weight * found[0, 1], weight * found[0, 2]
+                        m0 = weight * slice_moments[0, 6]
+                    mt, mv = weight * slice_moments[0, 1], weight * slice_moments[0, 2]
                     nt, nv, nz = nt + mt, nv + mv, nz + dz * m0
-                    tt, tv, vv = tt + weight * found[0, 3], tv + weight * found[0, 4], vv + weight * found[0, 5]
+                    tt, tv = tt + weight * slice_moments[0, 3], tv + weight * slice_moments[0, 4]
+                    vv = vv + weight * slice_moments[0, 5]
                     tz, vz, zz = tz + dz * mt, vz + dz * mv, zz + dz * dz * m0
                 density, r, s0, s1, s2 = densities[i], rotations[i], scales[i, 0], scales[i, 1], scales[i, 2]
                 d_densities[i] += n0
@@ -288,15 +289,15 @@ class Layout:
         self._spacing = np.broadcast_to(np.asarray(spacing, np.float64), 3).copy()
         corner = np.asarray(origin, np.float64)
         edge = self._spacing[::-1]
-        found, counts = np.empty(n, np.int64), np.empty(-(-n // _TASK), np.int64)
+        indices, counts = np.empty(n, np.int64), np.empty(-(-n // _TASK), np.int64)
         # Half a voxel more on all sides, because the search rounds to float32.
-        _near(means, scales, corner - edge / 2, corner + (np.asarray(shape[::-1]) - 0.5) * edge, cut, found, counts)
-        pieces = [found[k * _TASK : k * _TASK + count] for k, count in enumerate(counts)]
-        near = np.concatenate(pieces) if pieces else found
+        _near(means, scales, corner - edge / 2, corner + (np.asarray(shape[::-1]) - 0.5) * edge, cut, indices, counts)
+        pieces = [indices[k * _TASK : k * _TASK + count] for k, count in enumerate(counts)]
+        near = np.concatenate(pieces) if pieces else indices
         table, slices = np.empty((near.size, 12), np.float32), np.empty((near.size, 2), np.int32)
         _place(near, *self.parameters, corner, self._spacing, shape, faint, cut, kernel.is_compact, table, slices)
-        hit = slices[:, 1] > slices[:, 0]
-        self.hits, self._table, self._slices = near[hit], table[hit], slices[hit]
+        meets_grid = slices[:, 1] > slices[:, 0]
+        self.hits, self._table, self._slices = near[meets_grid], table[meets_grid], slices[meets_grid]
 
     def fill(self) -> F32:
         """Density [z, y, x] at the voxel centres."""

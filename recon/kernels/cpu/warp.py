@@ -19,19 +19,19 @@ _LEAST_SLAB = 8  # planes of a slab of the transpose
 
 
 @njit(inline="always")
-def _corner(at, size):
+def _corner(position, size):
     """The voxel below a position and the share of the voxel above.
 
     Positions more than one voxel outside have no share.
     """
-    at = min(max(at, _f(-1)), _f(size))
-    low = min(math.floor(at), size - 1)
-    return low, at - _f(low)
+    position = min(max(position, _f(-1)), _f(size))
+    low = min(math.floor(position), size - 1)
+    return low, position - _f(low)
 
 
 @njit(inline="always")
-def _within(at, size):
-    return _f(1) if -1 < at < size else _f(0)
+def _within(position, size):
+    return _f(1) if -1 < position < size else _f(0)
 
 
 @njit(inline="always")

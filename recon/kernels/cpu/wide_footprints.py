@@ -24,13 +24,13 @@ from numba import njit, prange
 
 from recon.base.kernel import Kernel
 from recon.kernels.cpu.activation import F32, OPTIONS
-from recon.kernels.cpu.footprints import HIDDEN, HU, HV, KV, SHEAR, K, RayCamera, W, _turned, add_shape
+from recon.kernels.cpu.footprints import HIDDEN, HU, HV, KV, SHEAR, K, RayCamera, W, _rotated, add_shape
 
 _f, _d = np.float32, np.float64
 
 
 @njit(inline="always", fastmath=True)
-def _seen(x, y, z, axes, focal, sod):
+def _projected(x, y, z, axes, focal, sod):
     """ax, ay, g, depth of a centre, see `cpu.footprints`."""
     if sod == 0:
         return _f(0), _f(0), focal, _f(1)
@@ -58,7 +58,7 @@ def _widen(
     for i in prange(table.shape[0]):
         if table[i, HU] < 0:
             continue
-        ax, ay, g, _ = _seen(means[i, 0], means[i, 1], means[i, 2], axes, f, source)
+        ax, ay, g, _ = _projected(means[i, 0], means[i, 1], means[i, 2], axes, f, source)
         e0, e1, _ = _path(means[i, 0], means[i, 1], axes, ax, ay, g, t)
         eu, ev, r = _d(e0), _d(e1), _d(table[i, SHEAR])
         vv, thin = _d(1) / _d(table[i, KV]), _d(1) / _d(table[i, K])
@@ -98,11 +98,11 @@ def _backward(
         guv = w * k * mtv - shear * guu
         gvv = thin - shear * (w * k * mtv + guv)
         x, y, z = means[i, 0], means[i, 1], means[i, 2]
-        ax, ay, g, depth = _seen(x, y, z, axes, f, source)
+        ax, ay, g, depth = _projected(x, y, z, axes, f, source)
         r, s0, s1, s2 = rotations[i], scales[i, 0], scales[i, 1], scales[i, 2]
-        pu0, pu1, pu2 = _turned(axes[0, 0], axes[0, 1], axes[0, 2], r)
-        pv0, pv1, pv2 = _turned(axes[1, 0], axes[1, 1], axes[1, 2], r)
-        pd0, pd1, pd2 = _turned(axes[2, 0], axes[2, 1], axes[2, 2], r)
+        pu0, pu1, pu2 = _rotated(axes[0, 0], axes[0, 1], axes[0, 2], r)
+        pv0, pv1, pv2 = _rotated(axes[1, 0], axes[1, 1], axes[1, 2], r)
+        pd0, pd1, pd2 = _rotated(axes[2, 0], axes[2, 1], axes[2, 2], r)
         a0, a1, a2 = g * s0 * (pu0 - ax * pd0), g * s1 * (pu1 - ax * pd1), g * s2 * (pu2 - ax * pd2)
         b0, b1, b2 = g * s0 * (pv0 - ay * pd0), g * s1 * (pv1 - ay * pd1), g * s2 * (pv2 - ay * pd2)
         c0, c1, c2 = guu * a0 + guv * b0, guu * a1 + guv * b1, guu * a2 + guv * b2

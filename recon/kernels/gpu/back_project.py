@@ -83,10 +83,10 @@ def filtered(
             col0, row0 = geometry.origin(view)
             u, v = (col - col0) * geometry.pixel_pitch, (row - row0) * geometry.pixel_pitch
             weighed *= geometry.sdd / torch.sqrt(geometry.sdd**2 + u**2 + v[:, None] ** 2)
-        wide = torch.nn.functional.pad(weighed.float(), zeros)
-        wide = wide[torch.arange(-beyond, rows + beyond, device=device).clamp(0, rows - 1)]
-        found = torch.fft.irfft2(torch.fft.rfft2(wide, shape) * factor, shape)
-        out[view] = found[beyond : beyond + rows, : out.shape[1]].T
+        padded = torch.nn.functional.pad(weighed.float(), zeros)
+        padded = padded[torch.arange(-beyond, rows + beyond, device=device).clamp(0, rows - 1)]
+        filtered_image = torch.fft.irfft2(torch.fft.rfft2(padded, shape) * factor, shape)
+        out[view] = filtered_image[beyond : beyond + rows, : out.shape[1]].T
     return out
 
 
@@ -105,8 +105,8 @@ def back_project(
         out: contiguous.
     """
     n_views, *pixels = filtered.shape
-    magnify, nearer = (sdd / (sod * pitch), 1 / sod) if sod > 0 else (1 / pitch, 0.0)
-    along = axes * np.array([magnify, magnify, nearer])[:, None]
+    magnify, per_depth = (sdd / (sod * pitch), 1 / sod) if sod > 0 else (1 / pitch, 0.0)
+    along = axes * np.array([magnify, magnify, per_depth])[:, None]
     terms = np.empty((n_views, 3, 4))
     terms[..., 0] = along @ [c[c.size // 2] for c in (x, y, z)] + [0.0, 0.0, 1.0]
     terms[..., 1:] = along * [(c[-1] - c[0]) / max(c.size - 1, 1) for c in (x, y, z)]

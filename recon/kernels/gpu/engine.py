@@ -80,8 +80,8 @@ class GpuStep:
 
     def lengths_for(self, model: StepModel, lists: int) -> list[int]:
         """Estimated lengths of the lists for another number of Gaussians."""
-        more = len(model.statistic) / max(1, len(self.model.statistic))
-        return [math.ceil(more * (room.pairs or 0)) for room in self._rooms][:lists] + [0] * (lists - len(self._rooms))
+        ratio = len(model.statistic) / max(1, len(self.model.statistic))
+        return [math.ceil(ratio * (room.pairs or 0)) for room in self._rooms][:lists] + [0] * (lists - len(self._rooms))
 
     def run(self, inputs: StepInputs) -> None:
         """Queue one step."""
@@ -93,11 +93,11 @@ class GpuStep:
     def settle(self) -> None:
         """Wait until the arrays of the model include all steps."""
         while self._queued:
-            done, *needed = self._counts.tolist()
+            n_done, *needed_pairs = self._counts.tolist()
             self._counts.zero_()
-            self._queued = self._queued[done:]
+            self._queued = self._queued[n_done:]
             if self._queued:
-                for room, pairs in zip(self._rooms, needed, strict=True):
+                for room, pairs in zip(self._rooms, needed_pairs, strict=True):
                     if room.pairs is not None and pairs > room.pairs:
                         room.grow(pairs)
                 self._prepare()
@@ -170,26 +170,26 @@ class GpuStep:
         run, views = GpuPass(means, log_scales, quaternions, raw, plan.unit, plan.kernel), plan.views
         sums, centres = [], []
         for k in range(views):
-            seen = GpuView(
+            rendered = GpuView(
                 run, plan.geometry, numbers[k * BEAM : (k + 1) * BEAM], plan.faint, plan.cut, plan.rays, rooms[k]
             )
             weights = None if self._weights is None else self._weights[k]
-            slope, of_view = plan.loss.slope(seen.image, self._images[k], self._maps[k], weights)
-            sums.append(of_view)
-            centres.append(seen.backward(slope / views if views > 1 else slope))
-        rates, others = numbers[views * BEAM :].split((_RATES, 4))
-        tv_weight, total = others[3:], numbers.new_zeros((), dtype=torch.float64)
+            slope, sums_of_view = plan.loss.slope(rendered.image, self._images[k], self._maps[k], weights)
+            sums.append(sums_of_view)
+            centres.append(rendered.backward(slope / views if views > 1 else slope))
+        rates, box_numbers = numbers[views * BEAM :].split((_RATES, 4))
+        tv_weight, box_variation = box_numbers[3:], numbers.new_zeros((), dtype=torch.float64)
         if plan.box is not None:
-            box = GpuBox(run, plan.box, plan.box_faint, plan.cut, others[:3], rooms[views])
-            total, slope = variation(box.density, tv_weight)
+            box = GpuBox(run, plan.box, plan.box_faint, plan.cut, box_numbers[:3], rooms[views])
+            box_variation, slope = variation(box.density, tv_weight)
             box.backward(slope, means_too=plan.moves)
         loss = plan.loss
         _tally[(1,)](
-            torch.cat(sums), total, tv_weight, self._counts, self._lengths, self._means, self._go, loss.pixels,
+            torch.cat(sums), box_variation, tv_weight, self._counts, self._lengths, self._means, self._go, loss.pixels,
             loss.ssim_weight, VIEWS=views, LISTS=len(rooms), BOXED=plan.box is not None,
         )  # fmt: skip
-        for moved in centres:
-            add_lengths(moved, views * plan.geometry.detector_shape[1] / 2, model.statistic, self._go)
+        for centre_gradients in centres:
+            add_lengths(centre_gradients, views * plan.geometry.detector_shape[1] / 2, model.statistic, self._go)
         adam_by(model.parameters, run.gradients(), model.first, model.second, rates, plan.bounds, self._go)
 
 
@@ -221,10 +221,13 @@ class Gpu:
 
     def misfit(self, image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
         """||w (image - target)|| / ||w target|| (float64 scalar on the device); 0 for a target of zeros."""
-        off, seen = image - target, target
+        difference, weighted_target = image - target, target
         if weights is not None:
-            off, seen = weights * off, weights * seen
-        squares, power = (off * off).sum(dtype=torch.float64), (seen * seen).sum(dtype=torch.float64)
+            difference, weighted_target = weights * difference, weights * weighted_target
+        squares, power = (
+            (difference * difference).sum(dtype=torch.float64),
+            (weighted_target * weighted_target).sum(dtype=torch.float64),
+        )
         return torch.where(power > 0, torch.sqrt(squares / power), 0.0)
 
     def unit_quaternions(self, quaternions: Tensor, first: Tensor, second: Tensor) -> None:
@@ -236,9 +239,9 @@ class Gpu:
 
     def taken(self, array: Tensor, origin: NDArray[np.int64]) -> Tensor:
         rows = torch.from_numpy(origin).to(self.device)
-        kept = array[rows.clamp(min=0)]
-        kept[rows < 0] = 0
-        return kept
+        rows_of_array = array[rows.clamp(min=0)]
+        rows_of_array[rows < 0] = 0
+        return rows_of_array
 
     def fused_step(self, model: StepModel, plan: StepPlan, earlier: GpuStep | None) -> GpuStep | None:
         exact = plan.geometry.is_cone and plan.rays.exact_above < math.inf

@@ -72,13 +72,13 @@ def _render(
 
 
 def render(
-    found: Footprints, shape: tuple[int, int], kernel: Kernel = Kernel.GAUSSIAN, room: Room | None = None
+    projected: Footprints, shape: tuple[int, int], kernel: Kernel = Kernel.GAUSSIAN, room: Room | None = None
 ) -> Tensor:
     """Image [row, col]: the sum of the footprints."""
-    lists = tile_lists(found.boxes, shape, _EDGE, room)
-    layers = found.table.new_empty((lists.shares, *shape))
+    lists = tile_lists(projected.boxes, shape, _EDGE, room)
+    layers = projected.table.new_empty((lists.shares, *shape))
     _render[(lists.n_tiles, lists.shares)](
-        found.table, lists.owners, lists.starts, layers, *shape, lists.counts[1], lists.shares,
+        projected.table, lists.owners, lists.starts, layers, *shape, lists.counts[1], lists.shares,
         EDGE=_EDGE, GROUP=_GROUP, MANY=_MANY, COMPACT=kernel.is_compact, num_warps=2,
     )  # fmt: skip
     return layers[0] if lists.shares == 1 else layers.sum(0)
@@ -118,14 +118,14 @@ def _moments(table, boxes, gradient, moments, cols, HIGH: tl.constexpr, WIDE: tl
     tl.store(m + 5, tl.sum(mvv))
 
 
-def moments(found: Footprints, gradient: Tensor, kernel: Kernel = Kernel.GAUSSIAN) -> Tensor:
+def moments(projected: Footprints, gradient: Tensor, kernel: Kernel = Kernel.GAUSSIAN) -> Tensor:
     """Moments [n, 6] (1, τ, v, ττ, τv, vv) of an image gradient [row, col] under each footprint."""
-    n = found.table.shape[0]
-    result = found.table.new_empty((n, 6))
+    n = projected.table.shape[0]
+    result = projected.table.new_empty((n, 6))
     if n > 0:
         high, wide = _BLOCK
         _moments[(n,)](
-            found.table, found.boxes, gradient, result, gradient.shape[1], HIGH=high, WIDE=wide,
+            projected.table, projected.boxes, gradient, result, gradient.shape[1], HIGH=high, WIDE=wide,
             COMPACT=kernel.is_compact, num_warps=1,
         )  # fmt: skip
     return result
@@ -153,7 +153,7 @@ class GpuPass:
         self._raw, self._unit, self.kernel = (quaternions, raw), unit, kernel
         scales, rotations, densities = activate(log_scales, quaternions, raw, unit)
         self.active = (means, scales, rotations, densities)
-        self.into = _zeros(self.active)
+        self.gradient_sums = _zeros(self.active)
 
     def view(self, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> GpuView:
         beam = torch.from_numpy(beam_of(geometry, view)).to(self._raw[1].device)
@@ -163,7 +163,7 @@ class GpuPass:
         return GpuBox(self, grid, faint, cut)
 
     def gradients(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        d_means, d_log_scales, d_rotations, d_densities = self.into
+        d_means, d_log_scales, d_rotations, d_densities = self.gradient_sums
         return d_means, d_log_scales, *activation_backward(*self._raw, self._unit, d_rotations, d_densities)
 
 
@@ -192,19 +192,19 @@ class GpuView:
                 self._rays = (exact, rays)
 
     def backward(self, gradient: Tensor) -> Tensor:
-        run, found = self._run, self.footprints
-        centres = found.table.new_empty((found.table.shape[0], 2))
+        run, projected = self._run, self.footprints
+        centres = projected.table.new_empty((projected.table.shape[0], 2))
         footprints_backward(
-            found, moments(found, gradient, run.kernel), *run.active, self._geometry, self._beam, *run.into, centres,
-            self._length, run.kernel,
+            projected, moments(projected, gradient, run.kernel), *run.active, self._geometry, self._beam,
+            *run.gradient_sums, centres, self._length, run.kernel,
         )  # fmt: skip
         if self._rays is not None:
             exact, rays = self._rays
-            some, moved = _zeros(rays.parameters), centres.new_empty((exact.numel(), 2))
-            rays.backward(gradient, *some, moved)
-            centres[exact] = moved
-            for total, part in zip(run.into, some, strict=True):
-                total[exact] += part  # no index is repeated, so the sum does not depend on the order
+            exact_gradients, exact_centres = _zeros(rays.parameters), centres.new_empty((exact.numel(), 2))
+            rays.backward(gradient, *exact_gradients, exact_centres)
+            centres[exact] = exact_centres
+            for gradient_sum, exact_gradient in zip(run.gradient_sums, exact_gradients, strict=True):
+                gradient_sum[exact] += exact_gradient  # no index is repeated, so the sum does not depend on the order
         return centres
 
 
@@ -218,4 +218,4 @@ class GpuBox:
         self.density = fill(self.placed, room)
 
     def backward(self, gradient: Tensor, *, means_too: bool = True) -> None:
-        fill_backward(self.placed, gradient, *self._run.active[1:], *self._run.into, means_too=means_too)
+        fill_backward(self.placed, gradient, *self._run.active[1:], *self._run.gradient_sums, means_too=means_too)

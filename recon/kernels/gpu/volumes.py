@@ -22,7 +22,7 @@ from recon.base.arrays import F32
 from recon.kernels.cpu.patches import EDGE
 from recon.kernels.cpu.spread import passes_of
 from recon.kernels.cpu.tents import cells_of, tents
-from recon.kernels.cpu.tv import Weights, dual_pace
+from recon.kernels.cpu.tv import Weights, dual_step_size
 from recon.kernels.gpu import require
 
 Shape = tuple[int, int, int]
@@ -56,13 +56,13 @@ def replace_by_residual(
 ) -> float:
     """Replace `model` by scale (data - model); returns Σ weight (data - model)², summed in float64. weight None: 1."""
     total = torch.zeros((), dtype=torch.float64, device=data.device)
-    for some in _parts(data, copies=2):
-        difference = torch.sub(data[some], model[some], out=model[some])
+    for part in _parts(data, copies=2):
+        difference = torch.sub(data[part], model[part], out=model[part])
         squares = difference * difference
         if weight is not None:
-            squares *= weight[some]
+            squares *= weight[part]
         if scale is not None:
-            difference *= scale[some]
+            difference *= scale[part]
         total += squares.sum(dtype=torch.float64)
     return float(total)
 
@@ -70,8 +70,8 @@ def replace_by_residual(
 def turn_of_steps(before: Tensor, start: Tensor, end: Tensor) -> float:
     """<start - end, end - before>, summed in float64: above zero if the step to `end` points back to `before`."""
     total = torch.zeros((), dtype=torch.float64, device=end.device)
-    for some in _parts(end, copies=3):
-        turn = (start[some] - end[some]).mul_(end[some] - before[some])
+    for part in _parts(end, copies=3):
+        turn = (start[part] - end[part]).mul_(end[part] - before[part])
         total += turn.sum(dtype=torch.float64)
     return float(total)
 
@@ -79,8 +79,8 @@ def turn_of_steps(before: Tensor, start: Tensor, end: Tensor) -> float:
 def dot(a: Tensor, b: Tensor) -> float:
     """<a, b> of two arrays of one shape, summed in float64."""
     total = torch.zeros((), dtype=torch.float64, device=a.device)
-    for some in _parts(a, copies=1):
-        total += (a[some] * b[some]).sum(dtype=torch.float64)
+    for part in _parts(a, copies=1):
+        total += (a[part] * b[part]).sum(dtype=torch.float64)
     return float(total)
 
 
@@ -104,19 +104,20 @@ def _summed(x: Tensor, axis: int, width: int) -> Tensor:
     size[axis] = count + 1
     out = x.new_zeros(size)
     for begin in range(width):
-        some = range(begin, n, width)  # voxels whose cells differ, so that no sum depends on an order
-        cells, weight = first[some.start :: width], torch.from_numpy(share[some.start :: width]).to(x.device)
+        voxels = range(begin, n, width)  # voxels whose cells differ, so that no sum depends on an order
+        cells, weight = first[voxels.start :: width], torch.from_numpy(share[voxels.start :: width]).to(x.device)
         for shift in (0, 1):
-            new = np.unique(cells + shift, return_index=True)[1]
-            for part in (new, np.setdiff1d(np.arange(len(cells)), new)):  # outer cells may hold two of them
+            first_voxels = np.unique(cells + shift, return_index=True)[1]
+            # outer cells may hold two of them
+            for part in (first_voxels, np.setdiff1d(np.arange(len(cells)), first_voxels)):
                 if part.size:
-                    here = torch.from_numpy(part).to(x.device)
+                    cells_of_part = torch.from_numpy(part).to(x.device)
                     line = [1, 1, 1]
                     line[axis] = part.size
-                    factor = (weight[here] if shift else 1 - weight[here]).reshape(line)
-                    at = torch.from_numpy((cells + shift)[part]).to(x.device)
-                    given = x.index_select(axis, here * width + begin) * factor
-                    out.index_copy_(axis, at, out.index_select(axis, at) + given)
+                    factor = (weight[cells_of_part] if shift else 1 - weight[cells_of_part]).reshape(line)
+                    target_cells = torch.from_numpy((cells + shift)[part]).to(x.device)
+                    values = x.index_select(axis, cells_of_part * width + begin) * factor
+                    out.index_copy_(axis, target_cells, out.index_select(axis, target_cells) + values)
     return out.narrow(axis, 0, count)
 
 
@@ -153,29 +154,29 @@ def spread(lines: Tensor, along_cols: NDArray[np.float64], along_rows: NDArray[n
     passes = passes_of(along_cols, along_rows)
     if passes == 0:
         return lines
-    found, shares = lines.clone(), np.stack([along_cols, along_rows]) / (2 * passes)
+    blurred, shares = lines.clone(), np.stack([along_cols, along_rows]) / (2 * passes)
     on_device = torch.from_numpy(shares.astype(np.float32)).to(lines.device)
     for _ in range(passes):
         for axis in (1, 2):
             if shares[axis - 1].any():
-                flow = (_after(found, axis) - _before(found, axis)).mul_(on_device[axis - 1, :, None, None])
-                _before(found, axis).add_(flow)
-                _after(found, axis).sub_(flow)
-    return found
+                flow = (_after(blurred, axis) - _before(blurred, axis)).mul_(on_device[axis - 1, :, None, None])
+                _before(blurred, axis).add_(flow)
+                _after(blurred, axis).sub_(flow)
+    return blurred
 
 
 def dual_step(
     x: Tensor, p: DualField, threshold: float, weights: Weights, nonnegative: bool, scratch: None,
     back: tuple[int, int] = (0, 0),
 ) -> None:  # fmt: skip
-    """p <- projection onto |p| <= 1 of p + pace D P(x - threshold Dᵀ p), in place; see `cpu.tv.dual_step`.
+    """p <- projection onto |p| <= 1 of p + step_size D P(x - threshold Dᵀ p), in place; see `cpu.tv.dual_step`.
 
     Memory: two volumes in addition to x and p.
     """
-    pace = dual_pace(threshold, weights)
+    step_size = dual_step_size(threshold, weights)
     point = _primal_point(x, p, threshold, weights, nonnegative)
     for axis, (field, weight) in enumerate(zip(p, weights, strict=True)):
-        _before(field, axis).add_(_after(point, axis) - _before(point, axis), alpha=pace * weight)
+        _before(field, axis).add_(_after(point, axis) - _before(point, axis), alpha=step_size * weight)
     # The difference from i to i + 1 belongs to voxel i or, in a mirror image, to voxel i + 1. The last one stays 0.
     length = point.zero_()
     owners = [_after(length, axis) if mirrored else _before(length, axis) for axis, mirrored in enumerate((*back, 0))]
@@ -215,26 +216,26 @@ def denoise(x: Tensor, threshold: float, nonnegative: bool, scratch: None, out: 
     """
     na, nb, nc = x.shape
     axes = (0, 1, 2) if nc >= EDGE else (0, 1)
-    places = [_mirrored(x.shape[axis], x.device) for axis in axes]
+    voxels_at = [_mirrored(x.shape[axis], x.device) for axis in axes]
     sums = x.new_zeros((na + 2 * _BEYOND, nb, nc))
     limit = threshold * 2 ** len(axes)
     plane = math.prod(n + 2 * _BEYOND for n in (nb, nc))
     step = max(1, _AT_ONCE // (4 * _BLOCK_COPIES * plane))
     for first in range(0, na + _BEYOND, step):
         end = min(first + step, na + _BEYOND)  # end of the blocks' first planes
-        given = x.index_select(0, places[0][first : end + _BEYOND])
+        extended = x.index_select(0, voxels_at[0][first : end + _BEYOND])
         for axis in axes[1:]:
-            given = given.index_select(axis, places[axis])
+            extended = extended.index_select(axis, voxels_at[axis])
         # A voxel sums its blocks in the order of their first planes, so the result does not depend on the first plane
         # of a part.
-        for at, value in reversed(list(enumerate(_shrunk(given, axes, limit, True)))):
-            sums[first + at : end + at] += value
+        for offset, value in reversed(list(enumerate(_shrunk(extended, axes, limit, True)))):
+            sums[first + offset : end + offset] += value
     torch.mul(sums[_BEYOND : na + _BEYOND], 16.0 ** -len(axes), out=out)
     if nonnegative:
         out.clamp_(min=0)
 
 
-def _shrunk(given: Tensor, axes: Sequence[int], limit: float, mean: bool) -> list[Tensor]:
+def _shrunk(extended: Tensor, axes: Sequence[int], limit: float, mean: bool) -> list[Tensor]:
     """The contributions of each block to voxels 0 to 3 along the first of `axes`, summed over blocks along the others.
 
     Args:
@@ -242,28 +243,28 @@ def _shrunk(given: Tensor, axes: Sequence[int], limit: float, mean: bool) -> lis
         mean: True: the first coefficient is kept.
     """
     axis, *others = axes
-    kept = []
-    for order, found in enumerate(_cosines(given, axis)):
+    coefficients = []
+    for order, cosines in enumerate(_cosines(extended, axis)):
         is_mean = mean and order == 0
         if others:
-            n = given.shape[others[0]] - 2 * _BEYOND
-            parts = _shrunk(found, others, limit, is_mean)
-            a, b, c, d = (part.narrow(others[0], _BEYOND - at, n) for at, part in enumerate(parts))
-            kept.append((d + c).add_(b).add_(a))
+            n = extended.shape[others[0]] - 2 * _BEYOND
+            parts = _shrunk(cosines, others, limit, is_mean)
+            a, b, c, d = (part.narrow(others[0], _BEYOND - offset, n) for offset, part in enumerate(parts))
+            coefficients.append((d + c).add_(b).add_(a))
         else:
-            kept.append(found if is_mean else hardshrink(found, limit))
-    return _values(*kept)
+            coefficients.append(cosines if is_mean else hardshrink(cosines, limit))
+    return _inverse_cosines(*coefficients)
 
 
-def _cosines(given: Tensor, axis: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Twice the four orthonormal cosine coefficients, along one axis, of each block of `given`."""
-    blocks = given.shape[axis] - _BEYOND
-    a, b, c, d = (given.narrow(axis, at, blocks) for at in range(EDGE))
+def _cosines(extended: Tensor, axis: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Twice the four orthonormal cosine coefficients, along one axis, of each block of `extended`."""
+    blocks = extended.shape[axis] - _BEYOND
+    a, b, c, d = (extended.narrow(axis, offset, blocks) for offset in range(EDGE))
     outer, inner, wide, near = a + d, b + c, a - d, b - c
     return outer + inner, wide * _LONG + near * _SHORT, outer - inner, wide * _SHORT - near * _LONG
 
 
-def _values(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> list[Tensor]:
+def _inverse_cosines(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> list[Tensor]:
     """Twice the inverse of the orthonormal transform."""
     outer, inner, wide, near = a + c, a - c, b * _LONG + d * _SHORT, b * _SHORT - d * _LONG
     return [outer + wide, inner + near, inner - near, outer - wide]
@@ -271,25 +272,26 @@ def _values(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> list[Tensor]:
 
 def _mirrored(n: int, device: torch.device) -> Tensor:
     """The voxel (of n) at each position from -3 to n + 2, mirrored at both faces."""
-    at = torch.arange(-_BEYOND, n + _BEYOND, device=device) % (2 * n)
-    return torch.minimum(at, 2 * n - 1 - at)
+    position = torch.arange(-_BEYOND, n + _BEYOND, device=device) % (2 * n)
+    return torch.minimum(position, 2 * n - 1 - position)
 
 
 def pulled_step(
-    x: Tensor, change: Tensor, momentum: float, pace: float, gradient: Tensor, pull: float, z: Tensor, nonnegative: bool
+    x: Tensor, change: Tensor, momentum: float, step_size: float, gradient: Tensor, pull: float, z: Tensor,
+    nonnegative: bool,
 ) -> None:  # fmt: skip
-    """change = momentum change + pace (gradient + pull (z - x)), x += change; with `nonnegative`, x is at least 0.
+    """change = momentum change + step_size (gradient + pull (z - x)), x += change; with `nonnegative`, x is at least 0.
 
     Memory: one volume.
     """
-    way = torch.sub(z, x)
-    torch.add(gradient, way, alpha=pull, out=way)
-    change.mul_(momentum).add_(way, alpha=pace)
-    torch.add(x, change, out=way)
+    step = torch.sub(z, x)
+    torch.add(gradient, step, alpha=pull, out=step)
+    change.mul_(momentum).add_(step, alpha=step_size)
+    torch.add(x, change, out=step)
     if nonnegative:
-        way.clamp_(min=0)
-    torch.sub(way, x, out=change)
-    x.copy_(way)
+        step.clamp_(min=0)
+    torch.sub(step, x, out=change)
+    x.copy_(step)
 
 
 def _before(array: Tensor, axis: int) -> Tensor:
