@@ -173,9 +173,9 @@ def poses_of(scan: SelectedScan, frames: I64) -> ScanPoses | None:
             "--tilt and --poses both set the roll of the projections. Omit --tilt, and add the tilt to the column "
             f"roll_deg of {table.path}."
         )
-    for option in (step.requested_by for step in geometry_steps(selection) if step.geometry):
+    for option_name in (step.requested_by for step in geometry_steps(selection) if step.geometry):
         raise ConfigError(
-            f"{option} determines from the projections what {table.path} already states. Give either {option} or "
+            f"{option_name} determines from the projections what {table.path} already states. Give either {option_name} or "
             "--poses. To omit the shifts that the scan states, add --poses ignore."
         )
     shifts = table.shifts * _pixels_per_unit(table, scan)
