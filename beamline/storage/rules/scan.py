@@ -165,8 +165,8 @@ def parts_joined(scan: ScanEvidence) -> Iterator[Finding]:
         sentence = f"This file is one of {n} parts of a scan: use {joined}, which has the frames of all parts"
     elif others := other_parts(scan.source.path):
         other_part = others[0]
-        sentence = f"This file has only a part of the scan; {other_part} has another part. Join the parts"
-        sentence += f": {to_join(run_of(scan.source.path.resolve().parent))}"
+        join = to_join(run_of(scan.source.path.resolve().parent))
+        sentence = f"This file has only a part of the scan, and {other_part} has another part: {join} of the scan"
     else:
         return
     yield Finding("error", "parts", f"{sentence}. To use only this part, copy the file out of the folder of its run.")

@@ -52,9 +52,9 @@ def turn(degrees: float, views: int, endpoint: bool = False) -> NDArray[np.float
 @pytest.mark.parametrize(
     ("true", "stated", "unit"),
     [
-        (turn(180, 240), np.arange(240.0), "the values are 0, 1, 2 and so on, so these values are frame numbers"),
-        (turn(180, 90), np.arange(90.0), "the values are 0, 1, 2 and so on, so these values are frame numbers"),
-        (turn(180, 120), turn(360, 120), "times as large as stated"),
+        (turn(180, 240), np.arange(240.0), "the values are 0, 1, 2 and so on, so they are frame numbers"),
+        (turn(180, 90), np.arange(90.0), "the values are 0, 1, 2 and so on, so they are frame numbers"),
+        (turn(180, 120), turn(360, 120), "times the stated angles"),
     ],
 )
 def test_angles_of_another_unit_are_refused_or_doubted(
@@ -79,7 +79,7 @@ def test_angles_that_the_views_show_are_not_doubted(balls: Balls, true: NDArray[
 
 def test_half_of_the_turn_is_told_by_one_pair_of_a_sample_within_the_field() -> None:
     (hit,) = told(scan(WITHIN, turn(360, 120), turn(180, 120)))
-    assert hit.severity == "error" and "times as large as stated" in hit.message
+    assert hit.severity == "error" and "times the stated angles" in hit.message
 
 
 @pytest.mark.parametrize("axis", [24.3, 44.3, 70.2])
