@@ -175,8 +175,8 @@ def poses_of(scan: SelectedScan, frames: I64) -> ScanPoses | None:
         )
     for option_name in (step.requested_by for step in geometry_steps(selection) if step.geometry):
         raise ConfigError(
-            f"{option_name} determines from the projections what {table.path} already states. Give either {option_name} or "
-            "--poses. To omit the shifts that the scan states, add --poses ignore."
+            f"{option_name} determines from the projections what {table.path} already states. Give either "
+            f"{option_name} or --poses. To omit the shifts that the scan states, add --poses ignore."
         )
     shifts = table.shifts * _pixels_per_unit(table, scan)
     table_rows = _rows_of_frames(table, source, frames)
