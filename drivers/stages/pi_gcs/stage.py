@@ -201,5 +201,5 @@ class PiGcsStage(LineStage):
             if code in EVENTS
             else "Find what stopped the stage (limit switch, person) before you move it again",
             state=f"It is at {self._travel.degrees(status.counts)}, {status.counts} counts"
-            + ("" if status.homed else ", which are not counted from the reference"),
+            + ("" if status.homed else ", but it has not found its reference, so its true angle is unknown"),
         )

@@ -32,7 +32,7 @@ LOST = [
         )
     ),
     ("pi_gcs", "disarm", "TRO 2 0", "", "TRO 2 0"),
-    ("pi_gcs", "end of a search", "FRF 1", "", r"\(no reason given\).*are not counted from"),
+    ("pi_gcs", "end of a search", "FRF 1", "", r"\(no reason given\).*has not found its reference"),
 ]  # fmt: skip
 """Controller, what is done, the command that is lost, what arrives instead, and what the error says."""
 
