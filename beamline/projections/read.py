@@ -20,7 +20,7 @@ from beamline.projections.protocols import ViewFilter, ViewStep
 from beamline.projections.registry import in_order
 from beamline.projections.selection import SelectedScan
 from beamline.projections.step import StepDone
-from beamline.projections.usable_views import gap_sentence
+from beamline.projections.usable_views import new_gap
 from beamline.storage.datasets import HELD
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules.evidence import ScanEvidence
@@ -252,15 +252,19 @@ def _copies(scan: ScanEvidence, data: NDArray[Any], frames: NDArray[np.int64]) -
 
 
 def no_beam_sentence(scan: ScanEvidence, requested: NDArray[np.int64], exposed: NDArray[np.int64]) -> str:
-    """A sentence about requested projections without beam, and the gap in angle that they leave; empty if all
-    projections have beam.
+    """A sentence about requested projections without beam, and the gap in angle if they are left out; empty if none is
+    known to be without beam.
+
+    Args:
+        requested: frames of the projections that were requested.
+        exposed: those of them that can be used.
     """
     without_beam = np.intersect1d(
         np.setdiff1d(requested, exposed), np.array(scan.illumination.known_without_beam, np.int64)
     )
     if not without_beam.size:
         return ""
-    gap = f", and{gap_text}" if (gap_text := gap_sentence(scan.source, requested, exposed)) else ""
+    gap = f", which leaves {gap_text}" if (gap_text := new_gap(scan, requested, exposed)) else ""
     they_are = "It is" if without_beam.size == 1 else "They are"
     return (
         f"{count(without_beam.size, 'projection')} of {scan.source.table.views.size} ({frames_text(without_beam)}) had "

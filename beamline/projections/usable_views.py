@@ -15,7 +15,6 @@ from recon.base.arrays import I64, bin_views
 
 if TYPE_CHECKING:
     from beamline.storage.flag_legend import FrameFlags
-    from beamline.storage.readers.base import ScanSource
     from beamline.storage.rules.evidence import ScanEvidence
     from beamline.storage.rules.flag_policy import FlagPolicy
     from recon.prep.resample import Resampling
@@ -152,19 +151,19 @@ def usable_views(scan: ScanEvidence, use_flags: bool) -> UsableViews:
         return UsableViews(scan, rows, flags=flags, jumps=policy.jumps)
     weights = np.where(policy.halved, np.float32(WARNED_WEIGHT), np.float32(1)) if policy.halved.any() else None
     kept_rows = np.flatnonzero(views & ~policy.left_out)
-    gap = gap_sentence(scan, rows, kept_rows)
-    sentence = f"{policy.in_words}{gap and f' They{gap}.'} --flags ignore weighs all projections equally."
+    gap = new_gap(scan, rows, kept_rows)
+    sentence = f"{policy.in_words}{gap and f' They leave {gap}.'} --flags ignore weighs all projections equally."
     regions = regions_of(policy)
     return UsableViews(scan, kept_rows, weights, int(policy.left_out.sum()), sentence, flags, regions, policy.jumps)
 
 
-def gap_sentence(scan: ScanEvidence | ScanSource, before: NDArray[np.int64], after: NDArray[np.int64]) -> str:
-    """ " leave 12° without a projection" if the remaining projections have a gap that was not there before; otherwise
-    empty.
+def new_gap(scan: ScanEvidence, before: NDArray[np.int64], after: NDArray[np.int64]) -> str:
+    """A text such as "12° without a projection" if the remaining projections have a gap that was not there before;
+    otherwise empty.
     """
     period = np.pi if scan.cone is None else 2 * np.pi
     narrow, wide = (_widest_gap(scan.table.angles[frames], period) for frames in (before, after))
-    return f" leave {np.degrees(wide):.3g}° without a projection" if wide >= WIDE * narrow else ""
+    return f"{np.degrees(wide):.3g}° without a projection" if wide >= WIDE * narrow else ""
 
 
 def _widest_gap(angles: NDArray[np.float64], period: float) -> float:

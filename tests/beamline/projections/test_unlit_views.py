@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -70,6 +72,21 @@ def test_line_integrals_that_were_never_written_are_left_out() -> None:
     source.quantity = "line_integrals"
     found, told = prepare(source, SELECTION)
     assert found.geometry.n_views == VIEWS - 2 and "2 projections of 45 (frames 5, 40) had no beam" in told[0]
+
+
+@pytest.mark.parametrize(
+    ("cone", "ending"), [(None, "They are left out."), ((50.0, 100.0), "which leaves 32° without a projection.")]
+)
+def test_rays_of_the_other_half_of_a_turn_fill_a_gap_only_in_a_parallel_beam(
+    cone: tuple[float, float] | None, ending: str
+) -> None:
+    round_sample = line_integrals()[0] + line_integrals()[0][:, ::-1]  # looks the same from all sides
+    lines = round_sample + np.random.default_rng(1).normal(0, 0.01, (VIEWS, *SHAPE))
+    lines[10:13] = 0
+    source = ArraySource(lines.astype(np.float32), [0] * VIEWS, 2 * ANGLES)
+    source.quantity = "line_integrals"
+    told = prepare(source, replace(SELECTION, cone=cone, pixel_size_mm=0.01))[1]
+    assert sum(line.endswith(ending) for line in told if "had no beam" in line) == 1
 
 
 def test_a_band_in_which_the_sample_is_opaque_has_views_with_light() -> None:
