@@ -83,8 +83,10 @@ class FistaTv(HalfVoxels):
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
 
     def refit(self, share: float) -> VoxelMethod:
-        """The method that computes the refits for error bars: `EarlyTv` with `share` times the default number of
-        iterations of `EarlyTv`, or with `share` times `iterations` of this method if `iterations` is smaller.
+        """The method that computes the refits for error bars: `EarlyTv`.
+
+        It makes `share` times as many iterations as `EarlyTv` makes by default. If this method makes fewer iterations
+        than that default, `share` is multiplied by its own number instead.
         """
         iterations = max(1, round(share * min(self.iterations, EarlyTv.iterations)))
         return EarlyTv(iterations, self.tv_weight, allow_negative=self.allow_negative)
@@ -268,8 +270,8 @@ class PnpDct(VoxelMethod):
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The residuals in the held-out projections, with `patch_threshold` or, if it is None, the best threshold.
 
-        If the sample is wider than the field of view and simpler methods were tried before, PnP-DCT is not tried, see
-        `Trial.wide`.
+        If the sample is wider than the field of view, PnP-DCT is not tried, see `Trial.wide`. It is tried anyway if no
+        method was tried before it, or if the caller gave a threshold.
         """
         if self.patch_threshold is None and so_far.tried and trial.wide:
             return Prediction(
