@@ -303,10 +303,12 @@ def test_baselines_of_a_reference() -> None:
     geometry = recon.Geometry.parallel(angles, (1, 16))
     grid = recon.Grid.matching(geometry)
     moved = recon.Volume(np.ascontiguousarray(m.transpose(2, 0, 1)), grid)
-    made = bench.volumes(recon.Projector(geometry, grid).forward(moved.data), geometry, moved)
-    assert {name: len(each) for name, each in made.items()} == {"piccs": 4, "dtv": 4, "rest": 2}
-    for each in (*made["piccs"], *made["rest"], made["dtv"][-1]):
+    lines = recon.Projector(geometry, grid).forward(moved.data)
+    made = bench.volumes(lines, geometry, moved)
+    assert {name: len(each) for name, each in made.items()} == {"piccs": 4, "dtv": 4, "rest": 2, "start": 12}
+    for each in (*made["piccs"], *made["rest"], made["dtv"][-1], made["start"][-1]):
         assert np.abs(each - moved.data).max() < 0.05
+    assert np.abs(bench.of_series(lines, angles, lines, geometry) - moved.data).max() < 0.2
 
 
 @pytest.mark.long  # two scans in real time
