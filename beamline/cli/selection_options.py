@@ -152,10 +152,10 @@ light_options = together(
         "water or SiO2.",
     ),
 )
-"""The options whose values `light_asked` uses."""
+"""The options whose values `dose_request` uses."""
 
 
-def light_asked(photons_per_count: float | None, dose_in: str | None) -> DoseRequest | None:
+def dose_request(photons_per_count: float | None, dose_in: str | None) -> DoseRequest | None:
     """Photons per count and material for the dose; None without --photons-per-count.
 
     Raises:

@@ -52,7 +52,7 @@ _ABSORPTION_RANGE, _TENTHS = 0.06, (10, 90)
 _FEW = 0.2  # up to this share of the projections, outliers are named one by one, however large they are
 # relative error of the angular range. A thorax with 12 % hardening has 0.011, measured scans up to 0.009, 60 other
 # scans at rest less
-_ANGLE_SCALE = 0.015
+_ANGLE_SCALE_TOLERANCE = 0.015
 # In steps: how close the measured range must be to the other way of counting the ends of a 180° or 360° scan (with or
 # without both ends, a step apart). Found in 31 of 40 scans with this error, and in none of 232 without it.
 _OF_A_STEP = 1 / 3
@@ -130,10 +130,8 @@ def _conditions_of(prepared: PreparedProjections, *, whole: bool) -> list[Consis
     geometry, data = prepared.geometry, prepared.seen.data
     view_numbers = spread(np.arange(len(data)), _VIEWS)
     edges, frames = reach_of(prepared.seen).edges, prepared.ids
-    wider_than_field, (faintness, air_is_off) = (
-        edges.beyond() or edges.passing(),
-        _faintness_and_air(data, view_numbers),
-    )
+    wider_than_field = edges.beyond() or edges.passing()
+    faintness, air_is_off = _faintness_and_air(data, view_numbers)
     conditions = list[ConsistencyCondition]()
     if geometry.rows_show_slices and not (geometry.is_off_middle and covers_the_circle(geometry.angles)):
         if wider_than_field or faintness > 1 or air_is_off:
@@ -170,7 +168,7 @@ def _conditions_within_the_field(
     same_axis = abs(moments.axis_col - geometry.axis_col) <= _SAME_AXIS
     angle_scale = _scale_of_angles(moments, geometry.angles)
     if ends := _ends_of_turn(data, geometry, moments.stretch):
-        angle_scale = replace(angle_scale, tolerance=_ANGLE_SCALE, sentence=f"{ends} {angle_scale.sentence}")
+        angle_scale = replace(angle_scale, tolerance=_ANGLE_SCALE_TOLERANCE, sentence=f"{ends} {angle_scale.sentence}")
     return [masses, _centre_of_mass(moments), _row_absorption(moments), *([angle_scale] if same_axis else [])]
 
 
@@ -375,9 +373,8 @@ def _fan_angle(data: F32, view_numbers: NDArray[np.intp], geometry: Geometry) ->
     slope_from_axis = pitch / (geometry.sdd + geometry.sod) if geometry.is_cone else np.inf  # SDD stated from the axis
     stated_from_axis = abs(math.atan(best_slope * half_width) - math.atan(slope_from_axis * half_width)) <= _SAME_FAN
     factor = _OFTEN_BY_AXIS if stated_from_axis else _OFTEN
-    certain = mismatch_stated > factor * mismatch_best and mismatch_best < min(
-        _AGREE, mismatch_typical / 2
-    )  # a round sample agrees with every fan
+    one_fan_agrees = mismatch_best < min(_AGREE, mismatch_typical / 2)  # a round sample agrees with every fan
+    certain = one_fan_agrees and mismatch_stated > factor * mismatch_best
     return ConsistencyCondition(
         "rays from both sides", abs(best_angle - stated_angle) if certain else np.nan, _FAN, "degrees of fan", sentence
     )
@@ -422,7 +419,7 @@ def _scale_of_angles(moments: ViewMoments, angles: NDArray[np.floating]) -> Cons
         "scan, or did the sample move? Give the right angles with --angles FILE (degrees, one per line), or compare "
         "slices made with different angles."
     )
-    tolerance = max(_ANGLE_SCALE, _SURE * moments.stretch_sigma)
+    tolerance = max(_ANGLE_SCALE_TOLERANCE, _SURE * moments.stretch_sigma)
     return ConsistencyCondition(
         "moments, scale of the angles", abs(moments.stretch), tolerance, "of the angles", sentence
     )

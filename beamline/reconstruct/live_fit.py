@@ -137,9 +137,9 @@ class ScanFollower:
         usable = checked_views(scan, live.warn)
         if not isinstance(self.state, Feeds):
             raise DataError(
-                f"{live.source.path}: the scan ended before the live fit had read any of its {usable.frames.size} "
-                f"usable projections (--views {live.selection.views}), so there is no live volume, and nothing was "
-                "written. Reconstruct the finished scan without --follow, or select other projections with --views."
+                f"There is no live volume: {live.source.path} was finished before the live fit began. The scan has "
+                f"{usable.frames.size} usable projections (--views {live.selection.views}). Nothing was written. "
+                "Reconstruct the finished scan without --follow, or select other projections with --views."
             )
         return ended(live, self.state, scan, usable)
 

@@ -101,9 +101,9 @@ class Ledger:
     # largest_residual: largest distance of a matched frame from the expected time of its trigger, in periods. The angle
     # of a frame may be wrong by this many steps
     largest_residual: float = 0.0
-    # possible_shift: in a closed ledger, the number of triggers by which all angles may be wrong. The reason: triggers
-    # that seem to be missing at one end may be missing at the other end, and an extra frame at the end may belong to
-    # the beginning. 0 if there are no such frames, or if the time of the first trigger is known
+    # possible_shift: number of triggers by which all angles may be wrong, after the ledger is closed. If frames are
+    # missing or extra at one end of a block, they may in truth be missing or extra at the other end, because times do
+    # not show where the block began. 0: nothing is missing or extra, or the time of the first trigger is known
     possible_shift: int = 0
 
     @property

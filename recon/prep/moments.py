@@ -26,9 +26,11 @@ class ViewMoments:
 
     Attributes:
         axis_col: column of the rotation axis.
-        col_shift: float64 [view], columns by which the centre of mass deviates from its sine curve about the axis.
+        col_shift: float64 [view], horizontal error of the projection in columns. The centre of mass of a rotating
+            sample follows a sine curve; this is its distance from that curve.
         mass: float64 [view], total absorption divided by its median, minus 1.
-        row_shift: float64 [view], rows by which the sample is lower than in the mean projection.
+        row_shift: float64 [view], vertical error of the projection in rows: how far the sample lies below its mean
+            height in all projections.
         stretch: actual rotation divided by the stated one, minus 1.
     """
 

@@ -10,7 +10,7 @@ import click
 
 from beamline.cli.options import POSITIVE, as_scan, json_option, scan_argument
 from beamline.cli.recipe import DATA, OUTPUT, Grouped, heading
-from beamline.cli.selection_options import light_asked, light_options, scan_options
+from beamline.cli.selection_options import dose_request, light_options, scan_options
 from beamline.cli.terminal import answering
 from beamline.core.errors import DataError
 from beamline.core.events import RuleBroken
@@ -80,15 +80,15 @@ def info(
     from beamline.features.files.validate import describe
     from beamline.storage.readers.open import SourceOptions
 
-    light_request = light_asked(photons_per_count, dose_in)
-    if (output is not None or light_request is not None) and not statistics:
+    requested_dose = dose_request(photons_per_count, dose_in)
+    if (output is not None or requested_dose is not None) and not statistics:
         raise click.UsageError("-o and --photons-per-count work only with --statistics.")
     if statistics and (truth or masks):
         raise click.UsageError(
             "--statistics is for scans, --truth and --masks are for volumes: leave out the options that do not fit."
         )
     if statistics:
-        _print_statistics(SourceOptions(file, **scan_facts), output, light_request, as_json)
+        _print_statistics(SourceOptions(file, **scan_facts), output, requested_dose, as_json)
     elif truth or masks:
         _print_measured(file, truth, masks, as_json)
     else:
@@ -113,7 +113,7 @@ def _described(facts: Mapping[str, Any]) -> list[str]:
 
 
 def _print_statistics(
-    scan: SourceOptions, output: Path | None, light_request: DoseRequest | None, as_json: bool
+    scan: SourceOptions, output: Path | None, requested_dose: DoseRequest | None, as_json: bool
 ) -> None:
     from beamline.monitor.digest import LARGEST
     from beamline.projections.scan_statistics import histograms, photon_dose_of, statistics_of, table
@@ -123,10 +123,10 @@ def _print_statistics(
         if output is not None:
             refuse_existing(output)
         with open_scan(scan) as source:
-            if light_request is not None:
-                light_request.refuse_impossible(source)
+            if requested_dose is not None:
+                requested_dose.refuse_impossible(source)
             statistics = statistics_of(source, answer.counting("statistics"))
-            dose = [] if light_request is None else photon_dose_of(source, statistics, light_request).in_words()
+            dose = [] if requested_dose is None else photon_dose_of(source, statistics, requested_dose).in_words()
         rows = table(statistics)
         if output is not None:
             write_whole(output, histograms(statistics))

@@ -126,9 +126,8 @@ def views_lit(scan: ScanEvidence, every: bool) -> Iterator[Finding]:
     """The projections are exposed throughout the scan. `beamline recon` lists dark projections and leaves them out."""
     views = scan.table.views
     looked_at = views if every else spread(views, VIEWS)
-    unlit = (
-        [] if scan.dark_and_flat is None else [row for row in looked_at.tolist() if scan.illumination.without_beam(row)]
-    )
+    can_tell = scan.dark_and_flat is not None
+    unlit = [row for row in looked_at.tolist() if can_tell and scan.illumination.without_beam(row)]
     if unlit:
         checked = f"{views.size} projections" if every else f"{looked_at.size} projections checked"
         more = "" if every else " `validate --deep` checks all projections."

@@ -286,9 +286,8 @@ def _angles_finding(scan: ScanEvidence, degrees: NDArray[np.float64], turn: _Tur
         times = 180 / turn.degrees
         unit = f"the true angles are probably {times:.3g} times the stated angles"
     pairs = (
-        f"Frames {turn.alike[0]} and {turn.alike[1]} are mirror images of each other. Two projections are mirror "
-        f"images if the sample turned by 180 degrees between them, but the stated angles of these frames differ by "
-        f"{turn.degrees:.4g} degrees"
+        f"Two projections that are 180 degrees apart are mirror images of each other. Frames {turn.alike[0]} and "
+        f"{turn.alike[1]} are mirror images, but their stated angles differ by {turn.degrees:.4g} degrees"
     )
     if turn.stated is not None:
         pairs += (
