@@ -255,7 +255,8 @@ def _mirror_images(
     step = float(np.ptp(degrees[sampled])) / (sampled.size - 1)
     partner = _nearest(coarse, views, degrees[sampled] + 180)
     pair_tolerance = min(float(np.median(np.diff(np.unique(degrees[views])))), step)
-    pairs = np.abs(degrees[partner] - degrees[sampled] - 180) <= pair_tolerance
+    # if the stated step is 180 degrees or more, a projection may be the nearest to its own partner
+    pairs = (partner != sampled) & (np.abs(degrees[partner] - degrees[sampled] - 180) <= pair_tolerance)
     stated = coarse.pairs_with_beam(sampled[pairs], partner[pairs])
     # The most similar pairs decide: a loose particle makes one pair different, wrong angles make all pairs different.
     stated_mismatch = min((coarse.mismatch(pair, mirrored=True) for pair in stated), default=np.inf)
