@@ -261,7 +261,7 @@ def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
         how = "from flat to flat" if whole else "from the usual flat of their group"
         if far.any():
             n = lights_in_turn(levels)
-            why = f"{n} thresholds, exposures or energies alternate" if n else "the beam is unstable"
+            why = f"{n} thresholds, exposures or energies were used in turn" if n else "the beam is unstable"
             sentence = f"the intensity of these flats differs by {changed:.0%} {how} (limit {limit:.0%}): {why}."
             yield BadFrames(group if whole else odd, changed, limit, sentence)
         elif odd:
