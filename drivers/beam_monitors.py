@@ -130,7 +130,7 @@ class PageSource:
                 while len(data) < MOST_BYTES and (piece := getattr(page, "read1", page.read)(_PIECE)):
                     data += piece
                     if self._clock.now() > deadline:
-                        raise TimeoutError("the page is too long for the page of a beam monitor")
+                        raise TimeoutError("the page did not end in time")
         except urllib.error.HTTPError as error:
             error.close()
             raise self._error(DeviceError, f"the server answered {error.code} {error.reason}") from error

@@ -233,8 +233,8 @@ class DcamOptions(CheckedSettings):
     )
     hot_pixels: HotPixelMode | None = setting(
         None,
-        "null: counts as measured. With a value, the camera repairs defective pixels with this sensitivity, which "
-        "alters the data.",
+        "null: counts as measured. With a value, the camera replaces the counts of pixels that it takes for "
+        "defective, which alters the data. The value says how many pixels the camera takes for defective.",
     )
     exposure_tolerance: float = setting(
         0.01,

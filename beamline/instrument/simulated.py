@@ -221,8 +221,8 @@ def _refuse_unrecordable(config: Config, scene: Scene) -> None:
     if 2 * row0 + rows != height:
         middle_start = (height - rows) // 2
         raise ConfigError(
-            "devices.camera.roi: the scene is a cone beam, whose central ray must meet the middle of the sensor's "
-            f"rows. {rows} rows must then begin at {middle_start}, not at {row0}. Nothing was started."
+            f"devices.camera.roi: begin the {rows} rows at row {middle_start}, not at {row0}. The scene has a cone "
+            "beam, and its central ray must meet the middle row of the sensor. Nothing was started."
         )
     if config.scan.offset_views:
         raise ConfigError("scan.offset_views needs a parallel beam, but the scene is a cone beam. Nothing was started.")

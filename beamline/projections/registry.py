@@ -47,11 +47,13 @@ def registered() -> tuple[type[PrepStep], ...]:
             raise ValueError(
                 f"{step.__name__} is not a ViewStep, PlaceStep or ScanStep with the name of the entry point"
             )
-        if names_of_options & taken or not by_name.keys() >= set(step.follows):
+        if names_of_options & taken:
             raise ValueError(
-                f"the correction step has an option of another step ({names_of_options & taken}), or follows a step "
-                f"that is not one of {sorted(by_name)}"
+                f"rename the options {sorted(names_of_options & taken)} of the step, because other correction steps "
+                "have options of the same names"
             )
+        if not by_name.keys() >= set(step.follows):
+            raise ValueError(f"the step follows {sorted(step.follows)}, but the steps are {sorted(by_name)}")
         taken.update(names_of_options)
         return step
 

@@ -62,7 +62,7 @@ class SkippedChecks:
             (
                 "gain, motion, floater, ghost, dips of beam",
                 without_earlier,
-                "no four earlier projections at even angular steps",
+                "fewer than four projections at equal angular steps came before",
             ),
             ("opposite", self.in_cone, "cone beam"),
             ("mass", self.wider_than_field, "sample wider than the field of view"),

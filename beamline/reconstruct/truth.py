@@ -77,7 +77,8 @@ def fit_truth(truth: NDArray[np.float32], grid: Grid, binning: int) -> Volume:
         truth = truth[: z * n, : y * n, : x * n].reshape(z, n, y, n, x, n).mean(axis=(1, 3, 5), dtype=np.float32)
     if not np.isfinite(truth).all() or np.ptp(truth) == 0:
         raise ConfigError(
-            "--truth cannot be used for a comparison, because the ground truth is constant or has no finite value."
+            "Give another --truth, because this ground truth has the same value in all voxels, or has values that "
+            "are not finite."
         )
     return Volume(truth, grid)
 

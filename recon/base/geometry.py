@@ -214,8 +214,8 @@ class Geometry:
         """Whether the sample moves along the rotation axis by half the height of the detector or more, as in a helical
         scan.
 
-        Only the middle half of the displacements, sorted by size, counts, so that single displaced projections have no
-        effect. In a helical scan, this middle half spans half of the whole displacement along the axis.
+        The highest and the lowest quarter of the positions are ignored, so that single displaced projections have no
+        effect. In a helical scan, the other positions span half of the whole displacement along the axis.
         """
         low, high = np.percentile(self.offsets[:, 1], (25, 75))
         return bool(4 * (high - low) >= self.detector_shape[0])

@@ -298,9 +298,11 @@ class Reconstruction:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a file that `save` or `Volume.save` has written. (`Volume.save` stores neither method nor settings.)
+        """Read a reconstruction from an .npz file that `save` wrote.
 
-        Sequences and arrays among the settings become lists. Values of a type that JSON does not have become text.
+        `load` also reads a file of `Volume.save`. Such a file has no method and no settings, so `method` and
+        `settings` are empty. In the settings, `save` stored arrays and sequences as lists, and values without a JSON
+        type as text.
 
         Raises:
             ValueError, KeyError: the file is not an .npz, or another program wrote it.

@@ -55,10 +55,9 @@ class Grid:
         """The grid with one voxel per detector pixel: (rows, cols, cols) voxels around the rotation axis. The middle
         slice is at the height of the middle detector row.
 
-        If projections are shifted, the function counts how many projections see each position along the columns and
-        along the rows. The grid covers the positions that are seen at least half as often as the position that is seen
-        most. Therefore small alignment shifts do not change the grid, and the grid of a scan that steps up and down
-        covers all heights.
+        If projections are shifted, the grid covers each position along the columns and along the rows that enough
+        projections see: at least half as many as see the position that most projections see. Therefore small alignment
+        shifts do not change the grid, and the grid of a scan that steps up and down covers all heights.
 
         If the axis is off the detector's middle (`Geometry.is_off_middle`), the box contains the field of view of a
         360° scan, as in `of_field`. With a smaller box, material that projections see outside the box would appear in

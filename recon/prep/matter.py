@@ -189,7 +189,10 @@ def _fractions(name: str) -> dict[int, float]:
         try:
             parsed = xraylib.CompoundParser(formula)
         except ValueError as error:
-            raise ValueError(f"{name!r} is not a known material and not a chemical formula") from error
+            raise ValueError(
+                f"{name!r} is not a known material and not a chemical formula; give a formula such as Al2O3, or one "
+                f"of {', '.join(sorted(KNOWN))}"
+            ) from error
         for z, share in zip(parsed["Elements"], parsed["massFractions"], strict=True):
             shares[z] = shares.get(z, 0.0) + mass / sum(parts.values()) * share
     return shares

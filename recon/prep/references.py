@@ -28,8 +28,8 @@ class References:
     """Darks (images without beam) and flats (images with beam but without sample).
 
     If darks or flats are a stack of frames [frame, row, col] of any real type, the stack is replaced by the mean of its
-    frames, without the zingers of single frames. The flat of a projection is computed from the flats of the same part
-    of the scan. If the part of the scan has no flats, the nearest group of flats is used.
+    frames, without the zingers of single frames. The flat of a projection is computed from the flats in the same part
+    of the scan (see `part_starts`). If this part contains no flats, the nearest group of flats is used.
 
     Attributes:
         dark: float32 [row, col], mean or median of the darks; or all darks as a stack.

@@ -132,11 +132,13 @@ class StreamingFit:
     def replace_views(self, data: F32, kept: ArrayLike | None = None) -> None:
         """Replace the line integrals [view, row, col] of all projections so far, in order, after a changed correction.
 
-        If the new data differ by more than a fifth (norm) from the data with which the Gaussians were placed, the
-        Gaussians are placed again. If the new data differ by at most a fifth, the model is kept. `kept` are the
-        numbers, in order, of the projections to which the new line integrals belong. If `kept` is given, the fit drops
-        all other projections. After projections were dropped, the learning rates start again from their first values,
-        because the model was fitted to the dropped projections, too.
+        The fit keeps its model, unless the new data differ by more than a fifth (norm) from the data with which the
+        Gaussians were placed. In that case the Gaussians are placed again.
+
+        Args:
+            kept: numbers, in order, of the projections that the fit keeps; `data` then contains only these. The fit
+                drops all other projections, and the learning rates start again from their first values, because the
+                model was fitted to the dropped projections, too. None: the fit keeps all projections.
 
         Raises:
             ValueError: as for `add_views`, or there are no projections; nothing is changed.
@@ -144,7 +146,9 @@ class StreamingFit:
         which = None if kept is None else np.asarray(kept, np.intp)
         views = self._stage.views if which is None else self._stage.views.only(which)
         if views.n == 0:
-            raise ValueError("there are no projections to replace, or none would be left")
+            raise ValueError(
+                "add projections before you replace them, and keep at least one: no projections would be left"
+            )
         images = checked_views(data, views.angles, views.template.detector_shape)
         self._stage = self._stage.with_images(images, which)
 

@@ -92,9 +92,10 @@ class FistaTv(HalfVoxels):
         return EarlyTv(iterations, self.tv_weight, allow_negative=self.allow_negative)
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The residuals in the held-out projections, with the weight `tv_weight`, or with the best weight if
-        `tv_weight` is None. Test volumes do not use half voxels, because the trial computes the held-out projections
-        from voxels as wide as a pixel.
+        """How well this method predicts the held-out projections of `trial`.
+
+        The method uses the weight `tv_weight`; if it is None, it uses the best weight that the trial has found. A
+        trial never uses half voxels, because it computes the held-out projections from voxels as wide as a pixel.
         """
         if self.tv_weight is not None or trial.weight is None:
             return trial.predicted(with_halves(self, False))

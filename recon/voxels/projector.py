@@ -63,9 +63,9 @@ class Projector:
     interpolation. Outside `grid`, the volume is 0. Line integrals are float32, in mm times the unit of the volume.
 
     Attributes:
-        matched: True if computed projections are sharpened to the resolution of measured projections.
-        device: device on which loops with this projector compute, see `recon.voxels.devices`; the methods of the
-            projector use the CPU.
+        matched: True: computed projections are sharpened to the resolution of the measured projections.
+        device: device on which an iterative method computes with this projector, see `recon.voxels.devices`. The
+            functions of this class always compute on the CPU.
         sharpened: [view, 2] variance in px² that the sharpening removes along columns and rows; None: no sharpening.
 
     Raises:
@@ -113,14 +113,16 @@ class Projector:
         return replace(self, matched=False) if self.matched else self
 
     def gain(self, weight: F32 | None = None) -> float:
-        """An upper limit of the factor by which sharpening raises the largest eigenvalue of AᵀWA. `weight` is W, the
-        weight of each ray.
+        """An upper limit of the factor by which sharpening raises the largest eigenvalue of AᵀWA.
 
-        Sharpening that removes the variance s (px²) raises the finest detail by the factor 1 + 2 s. Detail along the
-        rotation axis is raised by all projections. Detail across the axis is raised only by projections whose
-        directions nearly agree: they differ by less than a voxel at the edge of the field of view. The share of these
-        projections is computed as if all projections contributed equally to the eigenvector of the largest eigenvalue;
-        if some rays weigh more than others, the share is raised.
+        If sharpening removes the variance s (px²), it amplifies the finest detail by the factor 1 + 2 s. All
+        projections together amplify detail along the rotation axis. Detail across the axis is amplified only by
+        projections in nearly the same direction. Two directions count as the same if rays at the edge of the field of
+        view differ by less than a voxel. The limit assumes that every projection contributes equally to the
+        eigenvector of the largest eigenvalue. If rays have different weights, the limit is raised.
+
+        Args:
+            weight: W, the weight of each ray; None: 1.
         """
         if self.sharpened is None:
             return 1.0

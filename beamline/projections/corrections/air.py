@@ -223,8 +223,8 @@ def without_background(
             background_of_others.remove(binned_others.data)
     fitted.remove(data)
     sentence = (
-        f"Background of the beam subtracted: {description}. The line integral of air was up to "
-        f"{fitted.before:.2g} away from zero and is now {fitted.after:.2g}."
+        f"Background of the beam subtracted: {description}. The root mean square of the line integrals of air was "
+        f"{fitted.before:.2g} before and is {fitted.after:.2g} now."
     )
     return sentence, fitted.coefficients.mean(axis=0)
 
@@ -237,8 +237,9 @@ def _described(fitted: Background, levelled: float) -> str:
     if abs(levelled) >= LEAST_SIZE:
         before = f"a line through the air at the edges was subtracted ({levelled:+.3f} in line integral); then "
     return (
-        f"{before}a polynomial of order {fitted.order} in column and row was fitted to the {fitted.air:.0%} of the "
-        f"rays that miss the sample, and its values are {fitted.lowest:+.3f} to {fitted.highest:+.3f} in line integral"
+        f"{before}a polynomial of order {fitted.order} in column and row was fitted to the rays that miss the sample "
+        f"({fitted.air:.0%} of all rays). The polynomial is {fitted.lowest:+.3f} to {fitted.highest:+.3f} in line "
+        "integral"
     )
 
 

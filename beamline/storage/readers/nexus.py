@@ -145,7 +145,10 @@ def choose(file: h5py.File, detectors: list[Places], data: str | None = None) ->
     Raises DataError if no detector, or more than one, fits.
     """
     if not detectors:
-        raise DataError(f"{file.filename} has no NXdetector with frames [frame, row, col] and an image_key.")
+        raise DataError(
+            f"{file.filename} has no NXdetector with frames [frame, row, col] and an image_key. If the frames are in "
+            "another place of the file, give --data-path."
+        )
     if data is not None:
         return next(places for places in detectors if places.data == datasets.resolve(file, data))
     if len(detectors) == 1:

@@ -56,7 +56,7 @@ class FlagPolicy:
             (self.halved, (("has a warning and counts", "have a warning and count"), "half")),
             (
                 self.masked,
-                (("is", "are"), "flagged in a region, in which rays have half weight (with an alarm: weight 0)"),
+                (("is", "are"), "flagged in a part of the image, where rays have half weight (weight 0 for an alarm)"),
             ),
         ):
             if n := int(chosen.sum()):

@@ -204,8 +204,8 @@ def _exposures_in_words(scan: ScanEvidence, *rows: NDArray[np.int64]) -> str:
         words = [f"{np.median(each):g} s" for each in exposures]
         return f"Stated exposures: flats {words[0]}, projections {words[1]}."
     return (
-        "The file does not state the exposures of both flats and projections; a different exposure of the flats "
-        "would cause this difference."
+        "Check whether flats and projections had the same exposure time: the file does not state it, and different "
+        "exposure times would explain this difference."
     )
 
 
@@ -352,8 +352,8 @@ def _advice_on_steps(scan: ScanEvidence, n: int, most: float) -> str:
     steps = [f"--frames {first}::{n}" for first in range(n) if 0 < shares[first] >= _AS_GOOD * shares.max()]
     if not steps:
         return (
-            f"No step such as --frames 0::{n} selects projections with flats of the same intensity: also give "
-            "--darks and --flats."
+            f"Choose the projections of one intensity with --frames, for example --frames 0::{n}. Also give --darks "
+            "and --flats, because no such choice contains flats of the same intensity."
         )
     return (
         f"{' or '.join(steps)} selects projections of one intensity, with their darks and flats (projections "

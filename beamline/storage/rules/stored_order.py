@@ -106,12 +106,12 @@ def views_first(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "axis",
-            f"Check whether the {views.size} images are sinograms instead of projections, because the images look "
-            "like sinograms. All rows of an image have the same total absorption. The centre of the absorption "
-            f"follows a sine of the angle from row to row of an image (a sine explains {along_rows:.0%} of its "
-            f"changes), but not from image to image ({along_frames:.0%}). If the images are sinograms, the first "
-            "dimension counts detector rows: give --order row,view,col, or set the attribute axes of the dataset in "
-            "the file (y:theta:x).",
+            f"Check whether the {views.size} images are sinograms instead of projections. They look like sinograms, "
+            "because all rows of an image have about the same total absorption. The centre of mass of the rows also "
+            "follows a sine of the angle, as in a sinogram. From row to row of an image, the sine explains "
+            f"{along_rows:.0%} of the variance; from image to image it explains {along_frames:.0%}. If the images "
+            "are sinograms, give --order row,view,col, or set the attribute axes of the dataset in the file to "
+            "y:theta:x.",
         )
 
 

@@ -296,7 +296,7 @@ def _unit_problem(rows: NDArray[np.float64], settings: PandaAngles) -> str:
     step = 0.0 if known.size < _FEW else float(np.median(np.abs(np.diff(known))))
     if not step:
         whole = rows.size == settings.views
-        return f"has {known.size} positions in {rows.size} rows, but the positions do not change" if whole else ""
+        return f"has the same position in all {rows.size} rows" if whole else ""
     spans = step * np.array([[settings.views], [settings.views - 1]])
     if (np.abs(spans / (math.pi * np.array([1, 2])) - 1) < _NEAR).any():
         return (

@@ -107,7 +107,10 @@ def _core(volume: F32, mask: Mask, k: int, count: int) -> F32:
         return core
     values = volume[mask]
     if not values.size:
-        raise ValueError(f"the volume contains fewer than {count} materials, because no voxel is of material {k + 1}")
+        raise ValueError(
+            f"give a smaller --materials: the volume contains fewer than {count} materials, because no voxel is of "
+            f"material {k + 1}"
+        )
     low, high = (0, 25) if k == 0 else (75, 100) if k == count - 1 else (37.5, 62.5)
     low, high = np.percentile(values, (low, high))
     return values[(values >= low) & (values <= high)]

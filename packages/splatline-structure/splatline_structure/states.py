@@ -116,9 +116,9 @@ def measure_states(paths: Sequence[Path], output: Path, answer: Answer, values: 
         states.append(MeasuredState(path, x, n_views, numbers_of(reference, fit), fit.matches))
         if not fit.matches:
             answer.warn(
-                f"{path} shows another sample than {first}, or a sample that has mostly changed: fewer than half of "
-                "the particles of the reference are found in the state. The numbers of this state are not "
-                "determined."
+                f"{path} shows another sample than {first}, or most of the sample has changed: at most 65 % of the "
+                "particles of the reference were found in this scan. The numbers of this state are not determined. "
+                "Check the files, or take a later state as the reference."
             )
     if not any(state.matches for state in states):
         raise DataError(

@@ -199,7 +199,10 @@ def box_in(volume: F32, crop: Crop) -> Box:
     if crop == "finite" and not known.all():
         box = inscribed_box((nz, ny, nx), sample_circle(known[None].astype(np.float32)), 0.0)
         if not known[box[1:]].all():
-            raise ValueError("the volume has values that are not finite, and not only outside a circle")
+            raise ValueError(
+                "repair the volume: it has values that are not finite, and they are not all outside a circle as in a "
+                "masked volume"
+            )
         return box
     y, x = (np.arange(n) - (n - 1) / 2 for n in (ny, nx))
     away, field = np.hypot(y[:, None], x), min(ny, nx) / 2
@@ -251,7 +254,8 @@ def inscribed_box(shape: tuple[int, int, int], circle: tuple[float, float, float
     )
     if y.start >= y.stop or x.start >= x.stop:
         raise ValueError(
-            f"no voxel of {shape} is in the square inside the circle of radius {radius:.3g} voxels at {centre}"
+            f"no voxel of the volume {shape} lies in the square inside the sample's circle (radius {radius:.3g} "
+            f"voxels, centre {centre}); give --crop none"
         )
     return slice(0, shape[0]), y, x
 
@@ -266,16 +270,15 @@ def parts_of(
     `recon`. For a parallel beam only the rows of these slices, and some next to them, are read.
 
     Raises:
-        DataError, ConfigError: the scan cannot be read or prepared. ValueError: the method cannot use these
-            projections,
-            the slices are not those of the scan's rows, or the volume does not state its axis.
+        DataError, ConfigError: the scan cannot be read or prepared.
+        ValueError: the method cannot use these projections, the volume does not have the slices that the rows of the
+            scan give, or the volume does not state the rotation axis.
     """
     record, facts, slices = read.record, read.record.parameters, read.slices
     if math.isnan(record.axis_col):
         raise ValueError(
-            "give --parts or --quick, because the volume does not state the rotation axis, which is needed to "
-            "reconstruct the "
-            "halves"
+            "give --parts or --quick, because the volume does not state the rotation axis. The axis is needed to "
+            "reconstruct the volume again from each half of the projections"
         )
     rows: Any = None if facts.get("rows", "all") == "all" else tuple(map(int, str(facts["rows"]).split(":")))
     selection = Selection(
@@ -288,9 +291,8 @@ def parts_of(
         if selected.cone is None:
             if (end - first) // side != read.n_slices:
                 raise ValueError(
-                    f"give --parts or --quick, because the volume has {read.n_slices} slices, but rows {first}:{end} "
-                    "of its "
-                    f"scan give {(end - first) // side}"
+                    f"give --parts or --quick, because the volume and the scan do not fit together: the volume has "
+                    f"{read.n_slices} slices, but rows {first}:{end} of the scan give {(end - first) // side} slices"
                 )
             low, high = max(slices.start - _BESIDE, 0), min(slices.stop + _BESIDE, read.n_slices)
             picked = picked.selecting(replace(selection, rows=(first + low * side, first + high * side)))

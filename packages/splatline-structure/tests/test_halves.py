@@ -162,7 +162,8 @@ def test_rows_that_do_not_give_the_volumes_slices_are_refused_with_a_way_out(her
     read = replace(read, record=replace(read.record, parameters={"axis_col": 23.5}))
     with pytest.raises(
         ValueError,
-        match=r"give --parts or --quick, because the volume has 10 slices, but rows 0:16 of its scan give 16",
+        match=r"give --parts or --quick, because the volume and the scan do not fit together: the volume has 10 "
+        r"slices, but rows 0:16 of the scan give 16 slices",
     ):
         parts_of(read, here / "scan.h5", 2, pytest.fail, lambda *_: None)
 

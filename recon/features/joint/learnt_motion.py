@@ -187,8 +187,8 @@ def register_energies(
     The energy with the most projections is the reference. The volume at the reference energy, scaled by the mean
     absorption at another energy, predicts the projections at that energy. Six parameters describe how measured
     projections differ from predicted ones (see `recon.voxels.displacement`): the sample is shifted along x, y and z and
-    rotated about the axis; the image is shifted along the rows and magnified. The edges in the projections determine
-    the parameters, so a material whose absorption differs between two energies does no harm.
+    rotated about the axis; the image is shifted along the rows and magnified. The six parameters are found from the
+    edges in the projections. Therefore a material may absorb differently at two energies.
 
     Returns:
         The projections (interpolated if their magnification differs), and the displacement at each energy. All

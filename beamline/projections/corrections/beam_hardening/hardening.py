@@ -260,7 +260,7 @@ def fit_curve(views: F32, geometry: Geometry) -> tuple[Curve, float, float]:
                     "sample is denser outside"
                 )
             return curve, explained, after / max(uneven, 1e-30)
-    raise NoCurveError(f"the curve does not converge in {_ROUNDS} iterations")
+    raise NoCurveError(f"the fit of the curve did not converge in {_ROUNDS} iterations")
 
 
 def _small(geometry: Geometry) -> tuple[NDArray[np.int64], int, Geometry]:
