@@ -89,7 +89,7 @@ def _summary(outcome: MadeVolume, metrics: Mapping[str, Mapping[str, float]]) ->
     if BASELINE in metrics and result.method != BASELINE:
         summary += f" (FBP of the same projections: {formatted(best, metrics[BASELINE][best])})"
     if context.region is not None:
-        summary += f". Only the region {context.region.region} [z, y, x] is written and shown in pictures of slices"
+        summary += f". The file and the pictures of slices contain only the region {context.region.region} [z, y, x]"
     if result.chosen:
         summary += f". Reason for the method: {result.chosen}"
     return summary + "."

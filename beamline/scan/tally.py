@@ -129,8 +129,8 @@ def _block_discrepancies(tally: BlockTally) -> str:
             )
         if astray := sum(trigger in tally.off_target for trigger in tally.missing):
             text += (
-                f" In {astray} of the missing projections, the stage was not at the planned angle in any of {TRIES} "
-                "exposures (invalid rows)."
+                f" {astray} of them are missing because the stage was not at the planned angle in any of {TRIES} "
+                "exposures; these exposures are invalid rows of the scan file."
             )
         if tally.ignored:
             text += f" {tally.ignored} triggers gave no frame, because the camera was not ready and ignored them."

@@ -242,7 +242,7 @@ def as_unsigned(base: ScanSource, dtype: np.dtype[Any]) -> ScanSource:
     numbers that were stored as integers.
     """
     wrapped = f"int{8 * dtype.itemsize} that overflowed"
-    what = "real numbers, judging by their bits, because the TIFF has no SampleFormat" if dtype.kind == "f" else wrapped
+    what = "real numbers, as their bits show (the TIFF has no SampleFormat)" if dtype.kind == "f" else wrapped
     fact = f"{what}, read as {dtype}"
     return Frames(
         base,
