@@ -363,8 +363,7 @@ class Geometry:
 
         Raises:
             ValueError: there are no angles, an angle is not finite, or shift, roll, tilt or centre differ between
-                projections. The values of a shift, roll, tilt or centre that differs between projections are unknown
-                at a new angle.
+                projections, so that their values at a new angle are unknown.
         """
         for name in _OF_VIEWS[1:]:
             widest = float(np.ptp(getattr(self, name), axis=0).max())

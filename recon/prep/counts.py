@@ -90,11 +90,11 @@ class Counts:
             )
 
     def photons(self, view: int) -> tuple[F64, F64, F64]:
-        """Three images [row, col] of a projection: the counted photons (at least -v), the photons without the sample,
-        and v. In these images, v is the variance of a dark frame in photons², see `Counts`.
+        """Three images [row, col] of a projection: the counted photons, the photons without the sample, and the
+        variance v of a dark frame in photons² (see `Counts`).
 
-        If the flat of a pixel is not above the dark, the photons without the sample are 0. If the counts of a pixel are
-        NaN, its photons are NaN.
+        The counted photons are at least -v, and NaN if the counts of the pixel are NaN. If the flat of a pixel is not
+        above the dark, the photons without the sample are 0.
         """
         dark = np.asarray(self.dark, np.float64)
         flat = np.asarray(self.flat)

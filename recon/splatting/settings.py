@@ -189,10 +189,9 @@ class FitSettings:
 
     The default weight of total variation is at most 0.25. It is lower for samples with strong edges: if the density
     changes from voxel to voxel by more than 0.16 density units, the weight falls with the square of this change. In
-    the published
-    code (weight 0.05), the gradient of total variation with respect to the centres is too small by the square of the
-    voxel size, so total variation does not move the centres. The correct gradient raises the PSNR of the walnut by
-    0.2 dB (60 projections) and that of the battery by 0.4 dB (90 projections).
+    the published code (weight 0.05), the gradient of total variation with respect to the centres is too small by the
+    square of the voxel size, so total variation does not move the centres. The correct gradient raises the PSNR of the
+    walnut by 0.2 dB (60 projections) and that of the battery by 0.4 dB (90 projections).
 
     The published learning rates are for 30 000 steps, and a fit of 1000 steps with them is far from convergence. If
     all rates are multiplied by `pace` 20, with two projections per step and a low last rate, a fit of 1000 steps gains

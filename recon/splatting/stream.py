@@ -1,10 +1,10 @@
 """StreamingFit: a Gaussian fit that takes projections one by one during a scan.
 
-The first Gaussians are placed with an FBP of the first projections, as soon as these are well spread. If there is time
-for many steps, the Gaussians are placed once more when the number of projections has grown by half. They are then
-placed with the volume of the model plus an FBP of its residual. After that the model is kept. Each time the number of
-projections has grown by half, a new round begins. It allows more Gaussians, and density control clones and splits
-Gaussians where the new projections require it. Between arrivals the fit continues, with learning rates that suit any
+The first Gaussians are placed with an FBP of the first projections, as soon as these are well spread. Each time the
+number of projections has grown by half, a new round begins. It allows more Gaussians, and density control clones and
+splits Gaussians where the new projections require it. At the first of these rounds, the Gaussians are placed once more
+if there is time for many steps: with the volume of the model plus an FBP of its residual. After that the model is kept.
+Between arrivals the fit continues, with learning rates that suit any
 number of future steps (`anytime`). A new projection is used in the first step after its arrival. Of the other steps,
 every third uses one of the newest projections, and the rest use all projections evenly (`anytime`). One in sixteen
 projections is held out until the final fit.

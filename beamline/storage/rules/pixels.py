@@ -47,7 +47,7 @@ def numbers_wrapped(scan: ScanEvidence) -> Iterator[Finding]:
         return
     least, most = np.iinfo(scan.source.dtype).min, np.iinfo(scan.source.dtype).max
     what = (
-        f"{edges} pixels near {most} are next to pixels near {least}"
+        f"{edges} pixels with values near {most} are next to pixels with values near {least}"
         if edges
         else f"{low} pixels are below {below:.0f}"
     )

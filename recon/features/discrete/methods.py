@@ -57,11 +57,11 @@ class Discrete(HalfVoxels):
     φ pulls voxels to a few discrete grey levels, but not partial-volume voxels, which may lie between two levels; see
     `recon.features.discrete.mixture`. Memory: 10 volumes and 2 times the projections.
 
-    Held-out projections choose the number of levels, their values, and the factor on the FISTA-TV weight μ. The result
-    is the FISTA-TV volume if no discrete levels pass all tests with held-out projections, see `MaterialTrial.choose`.
-    If the projections are too few to hold some out and no `levels` are given, the result is the FISTA-TV volume, too.
-    If the caller gives a volume to start from, the method uses total variation alone. If no projections can be held
-    out, but `levels` are given, voxels are pulled weakly to these levels.
+    Held-out projections choose the number of levels, their values, and the factor on the FISTA-TV weight μ. If no
+    discrete levels pass all tests with held-out projections (see `MaterialTrial.choose`), the result is the FISTA-TV
+    volume. If there are too few projections to hold some out, it is also the FISTA-TV volume, unless `levels` are
+    given: then voxels are pulled weakly to these levels. If the caller gives a volume to start from, the method uses
+    total variation alone.
 
     Attributes:
         iterations: largest number of iterations over all projections, not counting the FISTA-TV iterations before them.
@@ -92,8 +92,8 @@ class Discrete(HalfVoxels):
             raise ValueError(f"levels must be two or more values in ascending order, got {self.levels}")
 
     def refit(self, share: float) -> VoxelMethod:
-        """The method that computes the refits for error bars: `EarlyTv` with `share` times the 16 iterations that were
-        used to calibrate error bars.
+        """The method of the refits for error bars: `EarlyTv`. It makes 16 iterations times `share`, because error bars
+        were calibrated with 16 iterations.
         """
         return EarlyTv(iterations=max(1, round(share * _REFIT_SWEEPS)), allow_negative=self.allow_negative)
 

@@ -182,10 +182,10 @@ def numbers_of(reference: ReferenceParticles, fit: ParticleFit) -> StateNumbers:
     """The values of the bodies in a state.
 
     A standard deviation here combines the error of the particle with the spread of all particles. A particle is cracked
-    in two cases. (1) Its change of mass is below the median by more than three standard deviations and by more than 1
-    %: a crack that is narrower than a voxel removes mass. (2) Its growth is above the median by more than three
-    standard deviations, and its change of mass is below the median by more than one: a dark core looks like a lower
-    grey level in a larger volume.
+    in two cases, compared with the median of all particles. (1) Its change of mass is lower by more than three standard
+    deviations and by more than 1 %: a crack that is narrower than a voxel removes mass. (2) Its growth is higher by
+    more than three standard deviations, and its change of mass is lower by more than one: a dark core looks like a
+    lower grey level in a larger volume.
     """
     changes, deviation = fit.measured, fit.noise
     seen = (fit.seen >= _SEEN) & fit.matches
