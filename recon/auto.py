@@ -89,7 +89,7 @@ class Auto(Method):
             return replace(self, candidates=self.candidates[:-1])._run_choice(choice, problem, control)
 
     def choose(self, problem: ReconProblem, control: RunControl) -> TrialChoice:
-        """Choose the candidate that predicts the held-out projections best.
+        """Choose the simplest candidate that predicts the held-out projections about as well as the best one.
 
         Raises:
             ValueError: all projections are zero, or no candidate can use the projections.
@@ -97,8 +97,8 @@ class Auto(Method):
         return self.tried(problem, control)[0]
 
     def tried(self, problem: ReconProblem, control: RunControl) -> tuple[TrialChoice, Trial | None]:
-        """The choice that `choose` returns, and the test reconstructions that led to it. Instead of test
-        reconstructions, the function returns None if it made none, or if the run was stopped.
+        """The choice that `choose` returns, and the test reconstructions that led to it (None if there were none, or if
+        the run was stopped).
         """
         data = problem.projections
         if not any(np.isfinite(view).any() and np.nan_to_num(view, posinf=0, neginf=0).any() for view in data):

@@ -192,8 +192,7 @@ def connect(
         check_stop: function that is called repeatedly during waits; an exception from it ends the wait.
 
     Raises:
-        DeviceError: a device does not answer. Before the error is raised, the devices that were opened are closed
-            again.
+        DeviceError: a device does not answer. The devices that were already open are closed again.
         ConfigError: the simulated scene is wrong.
     """
     with ExitStack() as opened:

@@ -67,9 +67,7 @@ class Selection:
                 object.__setattr__(self, name, tuple(getattr(pair, "tolist", lambda pair=pair: pair)()))
 
     def step(self, kind: type[S]) -> S:
-        """The correction step of the class `kind`. If the selection does not contain such a step, a new step with
-        default settings.
-        """
+        """The correction step of the class `kind`, with default settings if the selection does not contain it."""
         return next((step for step in self.steps if isinstance(step, kind)), None) or kind()
 
     def with_steps(self, *steps: NamedStep) -> Self:

@@ -53,8 +53,8 @@ class DeviceError(Exception):
         return __newobj__, (type(self), *self.args), vars(self)
 
     def told_by(self, device: str, problem: str, **changed: str) -> DeviceError:
-        """A copy of this error that names `device` and `problem` instead. For example, a stage reports an error of its
-        serial port as its own. `changed` replaces further parts of the error, by name.
+        """A copy of this error with another device and another problem, for example if a stage reports an error of its
+        serial port as its own. `changed` are other parts of the error to replace, such as `advice`.
         """
         parts = ("request", "reply", "expected", "advice", "state", "wire")
         return type(self)(device, problem, **({part: getattr(self, part) for part in parts} | changed))

@@ -141,8 +141,7 @@ class Geometry:
             where: the keyword arguments `axis_col`, `axis_row`, `shifts`, `roll` and `tilt`, see `Where`.
 
         Raises:
-            ValueError: an argument that `Geometry.parallel` would not accept either, or distances that are not finite
-                with 0 < sod <= sdd.
+            ValueError: as for `Geometry.parallel`; or a distance is not finite, or 0 < sod <= sdd is not true.
         """
         check_arguments(cls.cone, locals())
         if not 0 < sod <= sdd <= LONGEST or sdd > _MAGNIFIED * sod:
@@ -325,8 +324,8 @@ class Geometry:
         )
 
     def origin(self, view: int) -> tuple[float, float]:
-        """Pixel (col, row) at which one projection shows the origin of the object's frame. If the geometry has
-        `centres`, `origin` is the pixel at which the projection shows its own centre."""
+        """Pixel (col, row) at which one projection shows the origin of the object's frame; if the geometry has
+        `centres`, the pixel at which it shows its own centre."""
         return self.axis_col + float(self.shifts[view, 0]), self.axis_row + float(self.shifts[view, 1])
 
     def __repr__(self) -> str:

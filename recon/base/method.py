@@ -300,9 +300,8 @@ class Reconstruction:
     def load(cls, path: str | Path) -> Self:
         """Read a reconstruction from an .npz file that `save` wrote.
 
-        `load` also reads a file of `Volume.save`. Such a file has no method and no settings, so `method` and
-        `settings` are empty. In the settings, `save` stored arrays and sequences as lists, and values without a JSON
-        type as text.
+        `load` also reads a file of `Volume.save`, which contains no method and no settings: both are then empty. In the
+        settings, `save` stored arrays and sequences as lists, and values without a JSON type as text.
 
         Raises:
             ValueError, KeyError: the file is not an .npz, or another program wrote it.
@@ -432,6 +431,6 @@ class Method(Checked, ABC):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """Settings that make only a time limit of `seconds` end a run. Empty if the method ends by itself."""
+        """Settings with which a run ends only after `seconds`. Empty if the method cannot use a time limit."""
         lengths: dict[str, Plain] = {"seconds": seconds, "steps": _ENDLESS, "iterations": _ENDLESS}
         return {name: value for name, value in lengths.items() if name in types_of(cls)}

@@ -55,8 +55,8 @@ class Grid:
         """The grid with one voxel per detector pixel: (rows, cols, cols) voxels around the rotation axis. The middle
         slice is at the height of the middle detector row.
 
-        If projections are shifted, the grid covers each position along the columns and along the rows that enough
-        projections see: at least half as many as see the position that most projections see. Therefore small alignment
+        If projections are shifted, not all of them see every position. The grid covers a position along the columns or
+        rows if at least half as many projections see it as see the position seen most often. Therefore small alignment
         shifts do not change the grid, and the grid of a scan that steps up and down covers all heights.
 
         If the axis is off the detector's middle (`Geometry.is_off_middle`), the box contains the field of view of a

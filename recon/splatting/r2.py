@@ -35,9 +35,9 @@ _TOY_STEPS, _TOY_GAUSSIANS = 4, 50
 class R2(Fit):
     """R²-Gaussian fit: fits a sum of Gaussians to the projections (Zha et al. 2024, with refinements).
 
-    The learning rates decay over the time `seconds`. The time `seconds` includes the compilation of kernels, unless
-    `warm_up` was called before. The fit always makes its start and its first step, even if `seconds` is too short for
-    them. `Reconstruction.gaussians` is the fitted model before the voxel refinement.
+    The learning rates decay over the time `seconds`, which includes the compilation of kernels, unless `warm_up` was
+    called before. Even if `seconds` is too short, the fit places its first Gaussians and makes one step.
+    `Reconstruction.gaussians` is the fitted model before the voxel refinement.
 
     Attributes:
         steps: number of steps; 0: the result is the starting point; None: 400 steps, or, if `seconds` is given, as many

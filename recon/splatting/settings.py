@@ -201,8 +201,8 @@ class FitSettings:
     Attributes:
         loss: "l1" (published), "l2", or "poisson" (squares weighted by the transmission).
         ssim_weight: weight of 1 - SSIM, which is added to the loss.
-        tv_weight: weight of total variation; None: 3e5 s² / n. Here n is the number of pixels that a Gaussian covers. s
-            is the quotient of the noise of a pixel and the product of density unit and half width of the field of view.
+        tv_weight: weight of total variation; None: 3e5 s² / n, where n is the number of pixels that a Gaussian covers,
+            and s is the noise of a pixel, divided by (density unit x half the width of the field of view).
         tv_least: smallest weight of total variation in a fit of `paced_for` steps; lower in a longer fit, see
             `in_steps`.
         tv_size: voxels per side of the random box on which total variation acts; None: a quarter of the grid's side, 32

@@ -83,10 +83,8 @@ class FistaTv(HalfVoxels):
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
 
     def refit(self, share: float) -> VoxelMethod:
-        """The method that computes the refits for error bars: `EarlyTv`.
-
-        It makes `share` times as many iterations as `EarlyTv` makes by default. If this method makes fewer iterations
-        than that default, `share` is multiplied by its own number instead.
+        """The method that computes the refits for error bars: `EarlyTv` with `share` times the default number of
+        iterations of `EarlyTv`, or `share` times the number of this method, if that is smaller.
         """
         iterations = max(1, round(share * min(self.iterations, EarlyTv.iterations)))
         return EarlyTv(iterations, self.tv_weight, allow_negative=self.allow_negative)
@@ -265,14 +263,14 @@ class PnpDct(VoxelMethod):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """Empty, because a time limit cannot end PnP-DCT: its number of steps is fixed."""
+        """No settings: a time limit cannot end PnP-DCT, because its number of steps is fixed."""
         return {}
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The residuals in the held-out projections, with `patch_threshold` or, if it is None, the best threshold.
+        """How well PnP-DCT predicts the held-out projections with `patch_threshold`; None: with the best threshold.
 
-        If the sample is wider than the field of view, PnP-DCT is not tried, see `Trial.wide`. It is tried anyway if no
-        method was tried before it, or if the caller gave a threshold.
+        If the sample is wider than the field of view, PnP-DCT is not tried (see `Trial.wide`), unless it is the first
+        method or the caller gave a threshold.
         """
         if self.patch_threshold is None and so_far.tried and trial.wide:
             return Prediction(

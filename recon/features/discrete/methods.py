@@ -125,8 +125,8 @@ class Discrete(HalfVoxels):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """Empty, because a time limit cannot end discrete tomography: it needs all iterations of its tests to find
-        levels."""
+        """No settings: a time limit cannot end discrete tomography, because it needs all iterations of its tests to
+        find levels."""
         return {}
 
     def toy(self) -> Self:

@@ -85,7 +85,7 @@ class Cgls(VoxelMethod):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """Empty, because CGLS cannot use a time limit: more iterations do not improve its volume."""
+        """No settings: CGLS cannot use a time limit, because more iterations do not improve its volume."""
         return {}
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:

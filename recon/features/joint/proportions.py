@@ -206,9 +206,9 @@ def fit_share(
     Args:
         found: result of `fit_materials` from the same projections.
         states: indices in `found.densities` of the two states.
-        go_on: function called before each step, with the number of steps that may follow this step (there are at most
-            `STEPS` steps). If it returns False, `fit_share` returns `found` unchanged.
-        stop: function called many times within a step. If it returns True, `fit_share` returns `found` unchanged.
+        go_on: function called before each of at most `STEPS` steps, with the number of steps that may follow; if it
+            returns False, `fit_share` returns `found` unchanged.
+        stop: function called many times within a step; if it returns True, `fit_share` returns `found` unchanged.
 
     Raises:
         ValueError: `states` are not two different materials.
