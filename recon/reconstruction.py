@@ -172,9 +172,9 @@ def _warn_of_half_acquisition(views: Views) -> None:
     left, right = geometry.axis_col + 0.5, geometry.detector_shape[1] - 0.5 - geometry.axis_col
     if ("left" if left < right else "right") in reach_of(views).beyond:
         warnings.warn(
-            "take projections over 360 degrees without a gap, or distrust the densities: the sample reaches beyond "
-            f"the edge of the detector that is {min(left, right):.0f} columns from the rotation axis, and only a "
-            "full circle shows all rays that are farther from the axis. Without a full circle, densities in our "
+            "take projections over 360 degrees without a gap, or do not rely on the densities: the sample reaches "
+            f"beyond the edge of the detector that is {min(left, right):.0f} columns from the rotation axis, and only "
+            "a full circle shows all rays that are farther from the axis. Without a full circle, densities in our "
             "tests were too low: by up to a third with FBP, by up to an eighth with iterative methods "
             "(docs/numerics.md)",
             stacklevel=3,

@@ -175,14 +175,15 @@ _FINISH = option(
     excludes=EXCLUDED["finish"],
     type=WholeRange(min=0),
     help="Number of iterations on the voxel volume after the Gaussian fit; they restore edges, cracks and pores. 0: "
-    "none. Default: 8 with total variation, then PnP-DCT steps if these predict held-out projections better.",
+    "none. Default: 8 with total variation, then more with discrete levels or PnP-DCT, if one of these predicts "
+    "held-out projections better.",
 )
 _ITERATIONS = option(
     "--iterations",
     setting="iterations",
     type=WholeRange(min=1),
-    help="Number of iterations, for the methods that iterate on voxels. Default: a fixed number for each method, for "
-    "example 20 for fista-tv.",
+    help="Number of iterations, for the methods that iterate on voxels. fista-tv, discrete and os-sirt-tv end earlier "
+    "if the volume has converged. Default: a number for each method, for example 60 for fista-tv.",
 )
 _TV_WEIGHT = option(
     "--tv-weight",
@@ -291,8 +292,9 @@ method_options = together(
         excludes=EXCLUDED["quality"],
         type=NameChoice(list(PRESETS)),
         help="Preset. For r2: number of steps and of Gaussians (preview: 125 steps and half the Gaussians; standard: "
-        "400 steps; best: 1500 steps). For auto: preview tries only fbp and fista-tv; best tries all methods and "
-        "accepts any improvement. Default: standard.",
+        "400 steps; best: 1500 steps). For fista-tv, discrete and os-sirt-tv: when the iterations end (preview: "
+        "earlier; best: later, and fista-tv and discrete also use voxels of half a pixel). For auto: preview tries "
+        "only fbp and fista-tv; best tries all methods and accepts any improvement. Default: standard.",
     ),
     _GAUSSIANS,
     option(

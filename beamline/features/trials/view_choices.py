@@ -126,7 +126,7 @@ STUDIES = {
         Study(
             "sector",
             "A narrower sector",
-            "How much is lost with a narrower range of angles, apart from fewer projections?",
+            "How much is lost because the range of angles is narrower, and not because there are fewer projections?",
             sector,
         ),
         Study("random", "Views at random", "Are projections at random angles worse than evenly spread ones?", random),

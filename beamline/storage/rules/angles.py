@@ -62,7 +62,10 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
     if distinct.size == 1:
         only_angle = distinct[0]
         yield Finding(
-            "error", "angle-spread", f"All {angles.size} projections have the same angle, {only_angle:g} degrees."
+            "error",
+            "angle-spread",
+            f"All {angles.size} projections have the same angle, {only_angle:g} degrees. Give the right angles with "
+            "--angles FILE (degrees, one per line).",
         )
         return
     step = span / (distinct.size - 1)

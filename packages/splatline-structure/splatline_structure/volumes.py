@@ -177,7 +177,7 @@ def slabs_of(
         for taken, slab_slices in enumerate(slabs, 1):
             slab = np.asarray(record.volume.data[slab_slices], np.float32)[:, *box[1:]]
             if not np.isfinite(slab).all():
-                raise DataError(f"{path} has values that are not finite. Nothing was written.")
+                raise DataError(f"{path} has values that are not finite; measure other --slices. Nothing was written.")
             yield slab
             tell(taken, len(slabs))
 
