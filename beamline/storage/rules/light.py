@@ -204,8 +204,8 @@ def _exposures_in_words(scan: ScanEvidence, *rows: NDArray[np.int64]) -> str:
         words = [f"{np.median(each):g} s" for each in exposures]
         return f"Stated exposures: flats {words[0]}, projections {words[1]}."
     return (
-        "Check whether flats and projections had the same exposure time: the file does not state it, and different "
-        "exposure times would explain this difference."
+        "Check whether flats and projections had the same exposure time: the file does not state it for both. If the "
+        "exposure times differ, the line integrals are wrong."
     )
 
 

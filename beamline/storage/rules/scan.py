@@ -218,7 +218,7 @@ RULES: tuple[Rule, ...] = (
         f"{n} triggers gave no frame; the file lists these triggers."
     )),
     Row("warning", "missing-frames", lambda scan: (numbers := scan.source.attributes.get("missing_numbers")) and (
-        f"Look for lost files: the numbers {numbers} are missing in the names of the files."
+        f"Look for lost files: these numbers are missing in the names of the files: {numbers}."
     )),
     Row("info", "pixel-size", lambda scan: scan.source.pixel_size_mm is None and (
         "The pixel size is unknown: lengths will be in pixels, densities per pixel."

@@ -296,7 +296,10 @@ def _unit_problem(rows: NDArray[np.float64], settings: PandaAngles) -> str:
     step = 0.0 if known.size < _FEW else float(np.median(np.abs(np.diff(known))))
     if not step:
         whole = rows.size == settings.views
-        return f"has the same position in all {rows.size} rows" if whole else ""
+        if not whole:
+            return ""
+        some = f"only {known.size} positions" if known.size < _FEW else "the same position"
+        return f"has {some} in its {rows.size} rows"
     spans = step * np.array([[settings.views], [settings.views - 1]])
     if (np.abs(spans / (math.pi * np.array([1, 2])) - 1) < _NEAR).any():
         return (

@@ -181,8 +181,8 @@ DEGREES = np.linspace(0.0, 171.0, 20)
         (np.arange(20) * -50.0, "which look like encoder counts"),
         (np.arange(20) * 1234.5, "which look like encoder counts"),
         (DEGREES + 3.6e6, r"more than 1e\+06 degrees from zero \(positions .* to 3600171\)"),
-        (np.full(20, np.nan), "has 0 positions in 20 rows, but the positions do not change"),
-        (np.full(20, 7.0), "has 20 positions in 20 rows, but the positions do not change"),
+        (np.full(20, np.nan), "has only 0 positions in its 20 rows"),
+        (np.full(20, 7.0), "has the same position in its 20 rows"),
     ],
 )  # fmt: skip
 def test_a_pandaboxs_file_that_tells_no_angles_is_refused_before_the_scan(

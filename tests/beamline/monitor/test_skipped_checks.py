@@ -37,6 +37,6 @@ def test_views_at_uneven_angles_and_too_few_of_them_were_not_compared(fake: Any)
     jumps = [frame for at in (0, 50, 7, 91, 23, 60, 3) for frame in fake.views(1, first=at)]
     (text,) = said(fake.references() + jumps)
     assert text.startswith(
-        "gain, motion, floater, ghost, dips of beam in 7 of 7 projections (no four earlier projections"
+        "gain, motion, floater, ghost, dips of beam in 7 of 7 projections (fewer than four projections"
     )
     assert "in 1 of 1 projections" in said(fake.references() + fake.views(1))[0]

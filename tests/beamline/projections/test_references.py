@@ -101,7 +101,7 @@ def test_flats_darker_than_the_views_are_refused_where_the_exposures_are_known()
     assert found.geometry.n_views == 45
     assert any(
         re.search(
-            r"times as bright as the flats.*The file does not state the exposures of both flats and projections", each
+            r"times as bright as the flats.*Check whether flats and projections had the same exposure time", each
         )
         for each in warnings
     )

@@ -99,7 +99,7 @@ def test_what_flats_of_more_light_do_is_told_where_no_column_shows_air(light: fl
     share = re.search(r"0.095 too large \((\d+)% of the mean", line)
     assert share is not None
     assert int(share[1]) == pytest.approx(100 * more / mean, rel=0.05)
-    assert "The file does not state the exposures of both flats and projections" in line
+    assert "Check whether flats and projections had the same exposure time" in line
 
 
 @pytest.mark.parametrize(
