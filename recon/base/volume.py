@@ -74,8 +74,8 @@ class Grid:
     def of_field(cls, geometry: Geometry, voxel_size: float) -> Grid:
         """A box around the rotation axis that contains everything that any projection sees, for any axis position.
 
-        The box includes every point that a projection shows, also if projections are shifted. The box exists even if
-        the axis is outside the detector. Roll and tilt are ignored. The field of view of a cone is measured at the
+        The box includes every point that a projection shows, also if projections are shifted. The axis may be outside
+        the detector. Roll and tilt are ignored. The field of view of a cone is measured at the
         rotation axis. Few projections see material outside the field of view, because such material is in the beam only
         at angles at which it is far from the source. The box of a wide cone ends before it reaches the source.
         """

@@ -144,9 +144,9 @@ def fit_series(
     volume, smoothly in space and time, and is the identity in the middle of the scan (module `motion`). Mathematically
     this is the problem of `fit_materials`: knots replace the materials, and hat functions replace the cross sections.
     The z_j are the orthonormal components of all volumes x_k; the first component is the common part of all volumes. If
-    nothing moves, `fit_series` also tries volumes that are the mean volume multiplied by factors, which are smooth in
-    space. `fit_series` returns volumes with smooth factors if these volumes predict held-out projections better than
-    separate volumes. Smooth factors suit a sample of particles in which each particle takes up or loses material at its
+    nothing moves, `fit_series` also tries another model: each volume is the mean volume, multiplied in each voxel by a
+    factor that varies smoothly in space. `fit_series` returns the volumes of this model if they predict held-out
+    projections better than separate volumes do. Smooth factors suit a sample of particles in which each particle takes up or loses material at its
     own time. Steps, memory, `go_on` and `stop` of `fit_series` are as in `fit_materials`. Up to four tests come before
     the fit: they choose the weights, decide whether the sample moves, estimate the motion, and choose the smoothness of
     the factors. During each test, and while the factors are fitted, the first argument of `go_on` counts the remaining
