@@ -261,8 +261,8 @@ equal_time = option(
     },
     type=POSITIVE,
     metavar="EACH",
-    help="Compare the methods in equal time: each reconstruction stops after this number of seconds. Methods without "
-    "iterations, such as fbp, take the time they need.",
+    help="Compare the methods in equal time: each reconstruction stops after this number of seconds. fbp, cgls, "
+    "pnp-dct and discrete ignore this limit and take the time they need.",
 )
 """The time limit for every row of a table."""
 method_options = together(
