@@ -129,8 +129,8 @@ def _block_discrepancies(tally: BlockTally) -> str:
             )
         if astray := sum(trigger in tally.off_target for trigger in tally.missing):
             text += (
-                f" {astray} of the missing projections were exposed {TRIES} times, each time with the stage off the "
-                "planned angle (invalid rows)."
+                f" For {astray} of the missing projections, the stage was off the planned angle in each of {TRIES} "
+                "exposures (invalid rows)."
             )
         if tally.ignored:
             text += f" {tally.ignored} triggers gave no frame, because the camera was not ready and ignored them."
