@@ -30,9 +30,10 @@ from recon.voxels.odd_views import OddView, odd_views, odd_views_memory
 from recon.voxels.one_projection import RayCheck, project_parts
 from recon.voxels.residuals import SquaresLeft, residual, uniform_residual
 
-_VIEWS = 16  # largest number of used projections in the residual; limits the time
+_RESIDUAL_VIEWS = 16  # largest number of used projections in the residual; limits the time
 _ODD_VIEWS_WORK = 1.5  # duration of `odd_views`, in units of projecting the volume once
-_REGIONS, _REGION = 2**21, 12  # largest number of voxels in the regions (`metrics.sampled`); bytes per voxel
+# largest number of voxels in the regions (`metrics.sampled`); bytes per voxel
+_REGION_VOXELS, _REGION_BYTES = 2**21, 12
 
 
 class Aspect(Flag):
@@ -90,7 +91,7 @@ def judge(
     aspects: Aspect = Aspect.RESIDUAL,
     seed: int = 0,
     time: TimeLeft = _ALWAYS,
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Judgement:
     """Judge a volume by the projections it was made from, the held-out projections and the true volume.
 
@@ -102,60 +103,60 @@ def judge(
     Raises:
         ValueError: all projections are zero.
     """
-    seen, unseen, grid, begun = views.seen, views.unseen, volume.grid, time.now()
-    fitted, compares, seconds, uniform = Aspect.FIT in aspects, Aspect.RESIDUAL in aspects, 0.0, 0.0
+    seen, unseen, grid, start_time = views.seen, views.unseen, volume.grid, time.now()
+    fitted, compares, seconds, residual_of_uniform = Aspect.FIT in aspects, Aspect.RESIDUAL in aspects, 0.0, 0.0
     if compares and fitted:
-        uniform, rays = uniform_residual(grid, seen, _VIEWS)
-        seconds = (time.now() - begun) * seen.data.size / rays
-    work = stray_mass_share(seen.geometry, grid) if Aspect.STRAY in aspects else 0.0
-    looks_for_odd = fitted and time.leaves((work + _ODD_VIEWS_WORK) * seconds)
-
-    used, nothing = np.setdiff1d(np.arange(len(views.data)), views.held_out), RayCheck[Any]((), lambda: None)
-    left = residual(grid, seen, _VIEWS).renumbered(used) if compares else nothing
-    left_unseen = nothing
+        residual_of_uniform, rays = uniform_residual(grid, seen, _RESIDUAL_VIEWS)
+        seconds = (time.now() - start_time) * seen.data.size / rays
+    stray_work = stray_mass_share(seen.geometry, grid) if Aspect.STRAY in aspects else 0.0
+    looks_for_odd = fitted and time.leaves((stray_work + _ODD_VIEWS_WORK) * seconds)
+    used, no_check = np.setdiff1d(np.arange(len(views.data)), views.held_out), RayCheck[Any]((), lambda: None)
+    residual_check = residual(grid, seen, _RESIDUAL_VIEWS).renumbered(used) if compares else no_check
+    held_out_check = no_check
     if compares and unseen is not None:
-        left_unseen = residual(grid, unseen, len(unseen.data)).renumbered(views.held_out)
-    structure = unexplained(volume, seen, np.random.default_rng(seed)).renumbered(used) if fitted else nothing
-    odd = odd_views(grid, seen).renumbered(used) if looks_for_odd else nothing
-    parts = [part for check in (left, left_unseen, structure, odd) for part in check.parts]
-    begun = time.now()
-    project_parts(volume, views.geometry, parts, progress)
+        held_out_check = residual(grid, unseen, len(unseen.data)).renumbered(views.held_out)
+    structure_check = unexplained(volume, seen, np.random.default_rng(seed)).renumbered(used) if fitted else no_check
+    odd_check = odd_views(grid, seen).renumbered(used) if looks_for_odd else no_check
+    checks = residual_check, held_out_check, structure_check, odd_check
+    start_time = time.now()
+    project_parts(volume, views.geometry, [part for check in checks for part in check.parts], progress)
 
     figures, along_rows, held_out = {} if truth is None else by_truth(truth.data, volume.data), None, None
     if compares:
-        squares, along = left.result()
-        figures["residual"], along_rows = squares.residual, (along, uniform) if fitted else None
+        squares, residual_of_volume = residual_check.result()
+        figures["residual"] = squares.residual
+        along_rows = (residual_of_volume, residual_of_uniform) if fitted else None
         if unseen is not None:
-            held_out, _ = left_unseen.result()
+            held_out, _ = held_out_check.result()
             figures["residual_held_out"] = held_out.residual
         if not fitted:
             rays = squares.rays.sum() + (0 if held_out is None else held_out.rays.sum())
-            seconds = (time.now() - begun) * seen.data.size / rays
-    if (hidden := structure.result()) is not None:
-        figures["unexplained"] = hidden.share
-    looks_for_stray = Aspect.STRAY in aspects and (work == 0 or time.leaves(work * seconds))
+            seconds = (time.now() - start_time) * seen.data.size / rays
+    if (structure := structure_check.result()) is not None:
+        figures["unexplained"] = structure.share
+    looks_for_stray = Aspect.STRAY in aspects and (stray_work == 0 or time.leaves(stray_work * seconds))
     stray = stray_mass(volume, seen) if looks_for_stray else None
     figures |= {} if stray is None else {"stray": stray.share}
-    skipped = {
+    is_skipped = {
         "the check for mass where projections show no material": Aspect.STRAY in aspects and not looks_for_stray,
         "the check for projections that do not fit the volume": fitted and not looks_for_odd,
     }
-    late = tuple(name for name, left_out in skipped.items() if left_out)
-    return Judgement(figures, held_out, along_rows, hidden, stray, odd.result() or (), late, seconds)
+    skipped = tuple(name for name, left_out in is_skipped.items() if left_out)
+    return Judgement(figures, held_out, along_rows, structure, stray, odd_check.result() or (), skipped, seconds)
 
 
 def judge_memory(geometry: Geometry, *, fitted: bool) -> int:
     """Approximate memory of `judge` and `contrast` in bytes, without projections and volume."""
     grid = Grid.matching(geometry)
     of_fitted = fitted * odd_views_memory(geometry) + unexplained_memory(geometry)
-    most = max(of_fitted, stray_mass_memory(geometry, grid))
-    return max(most, _REGION * min(math.prod(grid.shape), _REGIONS))
+    memory_of_checks = max(of_fitted, stray_mass_memory(geometry, grid))
+    return max(memory_of_checks, _REGION_BYTES * min(math.prod(grid.shape), _REGION_VOXELS))
 
 
 def by_truth(truth: F32, volume: F32) -> dict[str, float]:
     """The figures of merit of a volume from the true volume, both [z, y, x]."""
-    of = {"psnr": metrics.psnr, "ssim3d": metrics.ssim3d, "nrmse": metrics.nrmse}
-    return {name: float(figure(truth, volume)) for name, figure in of.items()}
+    measures = {"psnr": metrics.psnr, "ssim3d": metrics.ssim3d, "nrmse": metrics.nrmse}
+    return {name: float(figure(truth, volume)) for name, figure in measures.items()}
 
 
 def contrast(reference: Volume, volumes: Mapping[str, Volume], seed: int) -> dict[str, dict[str, float]]:

@@ -87,11 +87,11 @@ def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tup
         NoCurveError: there are too few rays, or the sample has several materials.
     """
     p, length = np.ravel(np.asarray(measured, np.float64)), np.ravel(np.asarray(paths, np.float64))
-    few = slice(None, None, max(1, p.size // _MOST_RAYS))
-    p, length = p[few], length[few]
-    if (inside := np.count_nonzero(length)) < _FEWEST_RAYS:
+    every_nth = slice(None, None, max(1, p.size // _MOST_RAYS))
+    p, length = p[every_nth], length[every_nth]
+    if (n_inside := np.count_nonzero(length)) < _FEWEST_RAYS:
         raise NoCurveError(
-            f"too few rays go through the material: {inside} rays, but at least {_FEWEST_RAYS} are needed"
+            f"too few rays go through the material: {n_inside} rays, but at least {_FEWEST_RAYS} are needed"
         )
     slope = float(p @ length / (length @ length))
 
@@ -105,7 +105,7 @@ def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tup
 
     bounds = (1e-6 * slope, 0, 0.01), (np.inf, np.inf, 0.99)
     solution = least_squares(residuals, (0.8 * slope, 0.8 * slope, 0.4), bounds=bounds, x_scale=(slope, slope, 1.0))
-    hard, more, share = solution.x
+    hard, excess, share = solution.x
     explained = 1 - float(np.mean(solution.fun**2) / p.var())
     if explained < _LEAST_EXPLAINED:
         raise NoCurveError(
@@ -113,4 +113,4 @@ def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tup
             "the variance of the line integrals, and the thickness of a sample of one material explains at least "
             f"{_LEAST_EXPLAINED:.0%}"
         )
-    return curve_of_spectrum((hard + more, hard), (share, 1 - share), highest), explained
+    return curve_of_spectrum((hard + excess, hard), (share, 1 - share), highest), explained

@@ -23,7 +23,7 @@ from recon.voxels.held_out import LEAST_VIEWS, predicted_views
 from recon.voxels.methods import EarlyTv
 from recon.voxels.voxel_problem import NORM
 
-_REACH = 4.0  # distance in units of the length, beyond which the influence of a pixel is below exp(-4)
+_REACH_IN_LENGTHS = 4.0  # distance in units of the length, beyond which the influence of a pixel is below exp(-4)
 TRIAL_ROWS, TRIAL_COPIES = 8, 10
 """Number of rows in a search for the length, and float32 copies of their projections and volumes in memory."""
 LEAST_DROP = 0.1
@@ -33,9 +33,9 @@ A filter that lowers the residual by 8 % removes half the depth of the thin crac
 that gain 4 to 11 dB, the filter lowers it by 14 % or more. For two cathodes that were examined afterwards, it is 13.5
 and 13.9 %.
 """
-_FIRST, _LONGEST = 1.0, 64.0  # squared lengths in pixels²: at the start of the search, and the largest
-_ERRORS = 3.0  # a filter must predict better than no filter by this many standard errors
-_VIEWS, _ONE_IN, _SWEEPS, _TV_WEIGHT = 128, 8, 12, 5e-4  # settings of a test reconstruction with `EarlyTv`
+_FIRST_SQUARE, _LARGEST_SQUARE = 1.0, 64.0  # squared lengths in pixels²: at the start of the search, and the largest
+_STANDARD_ERRORS = 3.0  # a filter must predict better than no filter by this many standard errors
+_TRIAL_VIEWS, _ONE_IN, _SWEEPS, _TV_WEIGHT = 128, 8, 12, 5e-4  # settings of a test reconstruction with `EarlyTv`
 
 
 @dataclass(frozen=True)
@@ -64,34 +64,34 @@ class Paganin:
     @property
     def reach(self) -> int:
         """Distance in pixels over which pixels influence each other."""
-        return math.ceil(_REACH * max(self.length, 0.0 if self.unsharp is None else self.unsharp[0]))
+        return math.ceil(_REACH_IN_LENGTHS * max(self.length, 0.0 if self.unsharp is None else self.unsharp[0]))
 
     def retrieve(self, views: F32, floor: float) -> None:
         """Replace line integrals [view, row, col] by the filtered ones, in place. `floor` is the lowest
         transmission."""
         f2 = _squared_frequencies(views)
-        gain = 1 / (1 + (2 * math.pi * self.length) ** 2 * f2)
+        multiplier = 1 / (1 + (2 * math.pi * self.length) ** 2 * f2)
         if self.unsharp is not None:
             sigma, weight = self.unsharp
-            gain *= 1 + weight * (1 - np.exp(-2 * (math.pi * sigma) ** 2 * f2))
-        gain = gain.astype(np.float32)
+            multiplier *= 1 + weight * (1 - np.exp(-2 * (math.pi * sigma) ** 2 * f2))
+        multiplier = multiplier.astype(np.float32)
         for view in views:
-            transmission = _filtered_transmission(view, gain)
+            transmission = _filtered_transmission(view, multiplier)
             np.negative(np.log(np.maximum(transmission, floor, out=transmission), out=transmission), out=view)
 
 
 def _squared_frequencies(views: F32) -> F64:
     """[row, col] squared frequencies of the cosine transform of a frame, in (cycles per pixel)²."""
-    along = [(np.arange(n) / (2 * n)) ** 2 for n in views.shape[1:]]
-    return along[0][:, None] + along[1]
+    squares_of_axes = [(np.arange(n) / (2 * n)) ** 2 for n in views.shape[1:]]
+    return squares_of_axes[0][:, None] + squares_of_axes[1]
 
 
-def _filtered_transmission(view: F32, gain: NDArray[np.floating]) -> F32:
-    """The transmission of line integrals [row, col], with its cosine transform multiplied by `gain`."""
+def _filtered_transmission(view: F32, multiplier: NDArray[np.floating]) -> F32:
+    """The transmission of line integrals [row, col], with its cosine transform multiplied by `multiplier`."""
     from numba import config
 
     spectrum = fft.dctn(np.exp(-view), norm="ortho", overwrite_x=True, workers=config.NUMBA_NUM_THREADS)
-    spectrum *= gain
+    spectrum *= multiplier
     return np.asarray(fft.idctn(spectrum, norm="ortho", overwrite_x=True, workers=config.NUMBA_NUM_THREADS))
 
 
@@ -115,12 +115,12 @@ class FilterLength:
         length: in pixels.
         factor: one standard error of the squared length, as a ratio. It comes from the disagreement between held-out
             projections.
-        gain: relative decrease of the residual in these projections, compared with no filter.
+        residual_drop: relative decrease of the residual in these projections, compared with no filter.
     """
 
     length: float
     factor: float
-    gain: float
+    residual_drop: float
 
 
 def length_by_held_out_views(
@@ -144,7 +144,7 @@ def length_by_held_out_views(
     height = min(TRIAL_ROWS, views.shape[1])
     first = round(min(max(geometry.axis_row - height / 2, 0), views.shape[1] - height))
     rows = slice(first, first + height) if geometry.is_cone else busiest_rows(views, height)
-    sampled = spread(np.arange(geometry.n_views), _VIEWS)
+    sampled = spread(np.arange(geometry.n_views), _TRIAL_VIEWS)
     views, known = np.ascontiguousarray(views[sampled, rows]), known[rows]
     geometry = geometry.select(sampled).rows(rows.start, rows.stop)
     if material_columns := columns_of_matter(geometry, Grid.matching(geometry), views):
@@ -162,20 +162,24 @@ def length_by_held_out_views(
         unseen, images = predicted_views(method, Views(filtered, geometry, weights), grid, _ONE_IN, decide)
         norms[:] = decide.made[NORM]
         fringes = (1 + (2 * math.pi) ** 2 * square * _squared_frequencies(views)).astype(np.float32)
-        off = np.stack([_filtered_transmission(image, fringes) for image in images]) - np.exp(-views[unseen])
-        return np.sqrt(np.square(off[:, known]).mean(axis=1, dtype=np.float64))
+        differences = np.stack([_filtered_transmission(image, fringes) for image in images]) - np.exp(-views[unseen])
+        return np.sqrt(np.square(differences[:, known]).mean(axis=1, dtype=np.float64))
 
-    best = preferred_strength(residuals_of, _FIRST)
-    if best is None or best.strength > _LONGEST:
+    best = preferred_strength(residuals_of, _FIRST_SQUARE)
+    if best is None or best.strength > _LARGEST_SQUARE:
         return None
-    near = (_FIRST * 2.0 ** (round(math.log2(best.strength / _FIRST)) + half) for half in (-0.5, 0.0, 0.5))
-    best_square = min(near, key=lambda square: float(residuals_of(square).mean()))
-    least, none = residuals_of(best_square), residuals_of(0.0)
-    if not exceeds_standard_error(none - least, _ERRORS):
+    nearby_squares = (
+        _FIRST_SQUARE * 2.0 ** (round(math.log2(best.strength / _FIRST_SQUARE)) + exponent)
+        for exponent in (-0.5, 0.0, 0.5)
+    )
+    best_square = min(nearby_squares, key=lambda square: float(residuals_of(square).mean()))
+    filtered_best, unfiltered = residuals_of(best_square), residuals_of(0.0)
+    if not exceeds_standard_error(unfiltered - filtered_best, _STANDARD_ERRORS):
         return None
-    weaker, stronger = (residuals_of(best_square * 2.0**half) - least for half in (-0.5, 0.5))
+    weaker, stronger = (residuals_of(best_square * 2.0**exponent) - filtered_best for exponent in (-0.5, 0.5))
     # The search uses factors of √2, then the vertex of a parabola, for each projection. Factors of 2 would cost 1 dB.
     to_vertex = (weaker - stronger) / (2 * float((weaker + stronger).mean()))
     factor = 2.0 ** float(to_vertex.std(ddof=1) / (2 * math.sqrt(to_vertex.size)))
-    square, gain = best_square * 2.0 ** float(to_vertex.mean() / 2), 1 - float(least.mean() / none.mean())
-    return FilterLength(math.sqrt(square), factor, gain)
+    square = best_square * 2.0 ** float(to_vertex.mean() / 2)
+    residual_drop = 1 - float(filtered_best.mean() / unfiltered.mean())
+    return FilterLength(math.sqrt(square), factor, residual_drop)

@@ -22,12 +22,14 @@ from recon.base.stripes import AT_AXIS, NARROWEST, steadiness, without_layers
 from recon.base.units import warn_of_other_quantity
 
 _ROBUST = 1.4826  # 1 / MEDIAN, rounded. Reference volumes of the tests depend on this rounding in `by_sorting`
-_FAR = 3.0  # a column that differs from its neighbours by this many standard deviations is a stripe (Vo 2018: snr 3)
+# a column that differs from its neighbours by this many standard deviations is a stripe (Vo 2018: snr 3)
+_STRIPE_DEVIATIONS = 3.0
 _FEWEST_VIEWS = 8
-_MOST = 0.1  # largest share of columns that may be stripes
-_EVEN = 0.4  # largest ratio of standard deviation to shift; a stripe has nearly the same shift in all projections
-_ROWS = 8  # number of rows examined
-_COPIES = 13  # float32 copies of a sinogram in memory
+_LARGEST_STRIPE_SHARE = 0.1  # largest share of columns that may be stripes
+# largest ratio of standard deviation to shift; a stripe has nearly the same shift in all projections
+_LARGEST_VARIATION = 0.4
+_EXAMINED_ROWS = 8  # number of rows examined
+_SINOGRAM_COPIES = 13  # float32 copies of a sinogram in memory
 
 
 def width_for(cols: int) -> int:
@@ -51,9 +53,13 @@ def by_sorting(sinogram: F32, width: int | None = None) -> F32:
     smooth = median_filter(ranked, (1, width or width_for(sinogram.shape[1])), mode="nearest")
     out = np.empty_like(sinogram)
     np.put_along_axis(out, order, smooth, axis=0)
-    taken = sinogram - out
-    usual, most = np.median(taken, axis=0), np.float32(_FAR * _noise(sinogram))
-    return np.asarray(sinogram - np.clip(taken, usual - most, usual + most), np.float32)
+    difference = sinogram - out
+    median_difference = np.median(difference, axis=0)
+    largest_removed = np.float32(_STRIPE_DEVIATIONS * _noise(sinogram))
+    return np.asarray(
+        sinogram - np.clip(difference, median_difference - largest_removed, median_difference + largest_removed),
+        np.float32,
+    )
 
 
 def without_dead_columns(sinogram: F32) -> F32:
@@ -63,9 +69,11 @@ def without_dead_columns(sinogram: F32) -> F32:
     Such a column varies more, or less, between projections than the median of the columns around it. [our own: the
     variation is a median over projections, because edges of metal cross a column only in a few projections]
     """
-    rough = np.median(np.abs(sinogram - uniform_filter1d(sinogram, 11, axis=0, mode="nearest")), axis=0)
-    bad = _outliers(np.log(np.maximum(rough, 1e-12) / np.maximum(_around(rough, 4), 1e-12)), 2 * _FAR)
-    return _filled(sinogram, bad)
+    variation = np.median(np.abs(sinogram - uniform_filter1d(sinogram, 11, axis=0, mode="nearest")), axis=0)
+    is_dead = _outliers(
+        np.log(np.maximum(variation, 1e-12) / np.maximum(_running_median(variation, 4), 1e-12)), 2 * _STRIPE_DEVIATIONS
+    )
+    return _filled(sinogram, is_dead)
 
 
 def without_large_stripes(sinogram: F32) -> F32:
@@ -78,14 +86,14 @@ def without_large_stripes(sinogram: F32) -> F32:
     """
     ranked = np.sort(sinogram, axis=0)
     smooth = median_filter(ranked, (1, 2 * width_for(sinogram.shape[1]) + 1), mode="nearest")
-    drop = len(ranked) // 10
-    off = (ranked - smooth)[drop : len(ranked) - drop]
-    shift = off.mean(axis=0)
-    far = np.abs(shift) > _FAR * max(_noise(sinogram), median_deviation(shift))
-    far &= off.std(axis=0) < _EVEN * np.abs(shift)
-    if far.mean() > _MOST:
+    n_omitted = len(ranked) // 10
+    difference = (ranked - smooth)[n_omitted : len(ranked) - n_omitted]
+    shift = difference.mean(axis=0)
+    is_stripe = np.abs(shift) > _STRIPE_DEVIATIONS * max(_noise(sinogram), median_deviation(shift))
+    is_stripe &= difference.std(axis=0) < _LARGEST_VARIATION * np.abs(shift)
+    if is_stripe.mean() > _LARGEST_STRIPE_SHARE:
         return sinogram  # a tenth of all columns must belong to the sample
-    return sinogram - np.where(far, shift, 0).astype(np.float32)
+    return sinogram - np.where(is_stripe, shift, 0).astype(np.float32)
 
 
 def by_vo(sinogram: F32) -> F32:
@@ -110,11 +118,11 @@ def stripe_score(sinogram: F32) -> float:
     in a few projections. A body on the axis stays in its columns, so it counts as a stripe.
     """
     x = sinogram
-    off = (x[:, 2:-2] - (x[:, :-4] + x[:, 1:-3] + x[:, 3:-1] + x[:, 4:]) / 4) / math.sqrt(1.25)
-    noise = _noise(off)
-    of_columns = np.median(off, axis=0)
-    rough = np.diff(of_columns, 2) / math.sqrt(6)  # a large body changes slowly from column to column
-    spread = _ROBUST * np.median(np.abs(rough))
+    difference = (x[:, 2:-2] - (x[:, :-4] + x[:, 1:-3] + x[:, 3:-1] + x[:, 4:]) / 4) / math.sqrt(1.25)
+    noise = _noise(difference)
+    column_medians = np.median(difference, axis=0)
+    roughness = np.diff(column_medians, 2) / math.sqrt(6)  # a large body changes slowly from column to column
+    spread = _ROBUST * np.median(np.abs(roughness))
     return float(spread / max(noise * math.sqrt(math.pi / 2 / len(x)), 1e-12))
 
 
@@ -184,47 +192,48 @@ def remove_rings_in_place(
         float32 [row, col], the removed part averaged over the projections; and a sentence that describes the removal
         ("" for "none").
     """
-    taken = np.zeros(views.shape[1:], np.float32)
+    removed = np.zeros(views.shape[1:], np.float32)
     if rings == "none":
-        return taken, ""
+        return removed, ""
     if len(views) < _FEWEST_VIEWS or views.shape[2] < NARROWEST:
-        return taken, (
+        return removed, (
             f"Rings: nothing was removed. {len(views)} projections of {views.shape[2]} columns are too few to "
             f"distinguish stripes from the "
             f"sample (at least {_FEWEST_VIEWS} projections of {NARROWEST} columns are needed)."
         )
     order = np.argsort(angles, kind="stable")
     axis = (views.shape[2] - 1) / 2 if axis_col is None else axis_col
-    rows = _some_rows(views)
-    before = _typical_score(views[np.ix_(order, rows)])
-    stages = (REMOVERS[rings],) if rings != "auto" else _stages(views[np.ix_(order, rows)], axis)
+    rows = _examined_rows(views)
+    score_before = _typical_score(views[np.ix_(order, rows)])
+    stages = (REMOVERS[rings],) if rings != "auto" else _removers_for(views[np.ix_(order, rows)], axis)
     if not stages:
-        return taken, "Rings: nothing was removed, because the detector causes no visible stripes."
+        return removed, "Rings: nothing was removed, because the detector causes no visible stripes."
     for row in range(views.shape[1]):
         stripes = clean = views[order, row]
         for remove in stages:
             clean = remove(clean)
         level = np.median(stripes - clean, axis=0)
         clean = clean + (level - without_layers(level[None], axis)[0])
-        taken[row] = (stripes - clean).mean(axis=0)
+        removed[row] = (stripes - clean).mean(axis=0)
         views[order, row] = clean
-    after = _typical_score(views[np.ix_(order, rows)])
-    how = ", ".join(_NAMES.get(remove, rings) for remove in stages)
-    return taken, (
-        f"Rings: removed by {how}. The height of the stripes fell from {before:.1f} to {after:.1f} times the noise of "
-        "a column."
+    score_after = _typical_score(views[np.ix_(order, rows)])
+    names_of_removers = ", ".join(_NAMES.get(remove, rings) for remove in stages)
+    return removed, (
+        f"Rings: removed by {names_of_removers}. The height of the stripes fell from {score_before:.1f} to "
+        f"{score_after:.1f} times the noise of a column."
     )
 
 
-_FAINTEST = 1e-5  # share of the largest line integral; fainter stripes are visible only in projections without noise
+# share of the largest line integral; fainter stripes are visible only in projections without noise
+_FAINTEST_STRIPE = 1e-5
 
 
 def rings_seen(views: F32, angles: NDArray[np.float64], axis_col: float) -> str:
     """A warning with advice if pixel sensitivities differ so much that rings are visible; otherwise ""."""
     if len(views) < _FEWEST_VIEWS or views.shape[2] < NARROWEST:
         return ""
-    steady = steadiness(views[np.ix_(np.argsort(angles, kind="stable"), _some_rows(views))], axis_col)
-    if steady is None or not steady.stripes or steady.odd < _FAINTEST * float(np.abs(views).max()):
+    steady = steadiness(views[np.ix_(np.argsort(angles, kind="stable"), _examined_rows(views))], axis_col)
+    if steady is None or not steady.stripes or steady.odd < _FAINTEST_STRIPE * float(np.abs(views).max()):
         return ""
     difference, noises = steady.odd, steady.score
     return (
@@ -236,29 +245,29 @@ def rings_seen(views: F32, angles: NDArray[np.float64], axis_col: float) -> str:
     )
 
 
-def _some_rows(views: F32) -> NDArray[np.intp]:
-    return np.unique(np.linspace(0, views.shape[1] - 1, min(views.shape[1], _ROWS)).astype(np.intp))
+def _examined_rows(views: F32) -> NDArray[np.intp]:
+    return np.unique(np.linspace(0, views.shape[1] - 1, min(views.shape[1], _EXAMINED_ROWS)).astype(np.intp))
 
 
 def _typical_score(sinograms: F32) -> float:
     return float(np.median([stripe_score(sinograms[:, row]) for row in range(sinograms.shape[1])]))
 
 
-def _stages(sinograms: F32, axis_col: float) -> tuple[Callable[[F32], F32], ...]:
+def _removers_for(sinograms: F32, axis_col: float) -> tuple[Callable[[F32], F32], ...]:
     """The removal functions, in order, for the detector stripes in these rows [view, row, col]."""
     steady = steadiness(sinograms, axis_col)
-    strong = (without_dead_columns, without_large_stripes)
-    far_off = any(_far_off(sinograms[:, row], axis_col) for row in range(sinograms.shape[1]))
-    return (strong if far_off else ()) + ((by_sorting,) if steady is not None and steady.stripes else ())
+    for_strong = (without_dead_columns, without_large_stripes)
+    has_strong = any(_has_strong_stripes(sinograms[:, row], axis_col) for row in range(sinograms.shape[1]))
+    return (for_strong if has_strong else ()) + ((by_sorting,) if steady is not None and steady.stripes else ())
 
 
 def removal_memory(views: int, shape: tuple[int, int], rings: Rings) -> int:
     """Peak memory of `remove_rings_in_place` in bytes, without the projections, for a detector (rows, cols)."""
     rows, cols = shape
-    looked_at = views * min(rows, _ROWS) * cols
+    examined = views * min(rows, _EXAMINED_ROWS) * cols
     if rings == "none" or views < _FEWEST_VIEWS or cols < NARROWEST:
-        return 4 * (rows * cols + looked_at)
-    return 4 * (rows * cols + looked_at + _COPIES * views * cols)
+        return 4 * (rows * cols + examined)
+    return 4 * (rows * cols + examined + _SINOGRAM_COPIES * views * cols)
 
 
 def _noise(values: NDArray[np.floating]) -> float:
@@ -266,38 +275,39 @@ def _noise(values: NDArray[np.floating]) -> float:
     return float(_ROBUST * np.median(np.abs(np.diff(values, 2, axis=0))) / math.sqrt(6))
 
 
-def _far_off(sinogram: F32, axis_col: float) -> bool:
+def _has_strong_stripes(sinogram: F32, axis_col: float) -> bool:
     """Whether some columns are dead or deviate strongly. Such columns are at most a fifth of all, are not near the
     axis, and their mirrored columns do not deviate."""
     cleaned = without_large_stripes(without_dead_columns(sinogram))
     changed = (cleaned != sinogram).any(axis=0).sum()
-    strong = np.abs(cleaned - sinogram).max(axis=0) > 0.1 * max(float(np.ptp(np.median(sinogram, axis=0))), 1e-12)
-    columns = np.arange(strong.size)
-    across = np.rint(2 * axis_col - columns).astype(int)
-    inside = (across >= 0) & (across < strong.size)
-    mirrored = inside & maximum_filter1d(strong, 3)[np.clip(across, 0, strong.size - 1)]
-    own = strong & ~mirrored & (np.abs(columns - axis_col) > AT_AXIS)
-    return bool(own.any() and changed <= strong.size / 5)
+    is_strong = np.abs(cleaned - sinogram).max(axis=0) > 0.1 * max(float(np.ptp(np.median(sinogram, axis=0))), 1e-12)
+    columns = np.arange(is_strong.size)
+    mirrored_columns = np.rint(2 * axis_col - columns).astype(int)
+    is_inside = (mirrored_columns >= 0) & (mirrored_columns < is_strong.size)
+    is_mirrored_strong = is_inside & maximum_filter1d(is_strong, 3)[np.clip(mirrored_columns, 0, is_strong.size - 1)]
+    is_detector_stripe = is_strong & ~is_mirrored_strong & (np.abs(columns - axis_col) > AT_AXIS)
+    return bool(is_detector_stripe.any() and changed <= is_strong.size / 5)
 
 
-def _around(values: NDArray[np.floating], width: int) -> NDArray[np.floating]:
+def _running_median(values: NDArray[np.floating], width: int) -> NDArray[np.floating]:
     return np.asarray(median_filter(values, 2 * (width // 2) + 1, mode="nearest"))
 
 
 def _outliers(values: NDArray[np.floating], limit: float) -> NDArray[np.bool_]:
-    off = values - np.median(values)
-    return np.asarray(np.abs(off) > limit * max(median_deviation(off), 1e-12))
+    deviations = values - np.median(values)
+    return np.asarray(np.abs(deviations) > limit * max(median_deviation(deviations), 1e-12))
 
 
-def _filled(sinogram: F32, bad: NDArray[np.bool_]) -> F32:
+def _filled(sinogram: F32, is_bad: NDArray[np.bool_]) -> F32:
     """The values with bad columns filled by linear interpolation between good columns. They are unchanged if more than
     half of the columns are bad."""
-    if not bad.any() or bad.mean() > 0.5:
+    if not is_bad.any() or is_bad.mean() > 0.5:
         return sinogram
-    good, wanted = np.flatnonzero(~bad), np.flatnonzero(bad)
-    after = np.clip(np.searchsorted(good, wanted), 0, good.size - 1)
-    left, right = good[np.clip(after - 1, 0, None)], good[after]
-    share = np.clip((wanted - left) / np.maximum(right - left, 1), 0, 1).astype(np.float32)
+    good_columns, bad_columns = np.flatnonzero(~is_bad), np.flatnonzero(is_bad)
+    next_good = np.clip(np.searchsorted(good_columns, bad_columns), 0, good_columns.size - 1)
+    left_columns, right_columns = good_columns[np.clip(next_good - 1, 0, None)], good_columns[next_good]
+    place = (bad_columns - left_columns) / np.maximum(right_columns - left_columns, 1)
+    right_weight = np.clip(place, 0, 1).astype(np.float32)
     out = sinogram.copy()
-    out[:, wanted] = (1 - share) * sinogram[:, left] + share * sinogram[:, right]
+    out[:, bad_columns] = (1 - right_weight) * sinogram[:, left_columns] + right_weight * sinogram[:, right_columns]
     return out

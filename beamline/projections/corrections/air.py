@@ -118,12 +118,12 @@ class Air:
             views.seen, self.surface, views.lines.unseen, areas(views.corrected.masked), levelled
         )  # fmt: skip
         has_line = any(views.corrected.air_columns)
-        nothing = (
+        unchanged_text = (
             "no polynomial subtracted, only a straight line through the air at the edges"
             if has_line
             else "nothing subtracted"
         )
-        parameters: dict[str, Any] = {"surface": self.surface, "background": sentence or nothing}
+        parameters: dict[str, Any] = {"surface": self.surface, "background": sentence or unchanged_text}
         return StepDone(sentence, parameters if terms is None else {**parameters, "background_terms": terms})
 
 
@@ -233,11 +233,11 @@ def _described(fitted: Background, levelled: float) -> str:
     """A sentence about the fitted polynomial, and about the line that was subtracted before the fit."""
     from recon.prep.background import LEAST_SIZE
 
-    before = ""
+    line_text = ""
     if abs(levelled) >= LEAST_SIZE:
-        before = f"a line through the air at the edges was subtracted ({levelled:+.3f} in line integral); then "
+        line_text = f"a line through the air at the edges was subtracted ({levelled:+.3f} in line integral); then "
     return (
-        f"{before}a polynomial of order {fitted.order} in column and row was fitted to the rays that miss the sample "
+        f"{line_text}a polynomial of order {fitted.order} in column and row was fitted to the rays that miss the sample "
         f"({fitted.air:.0%} of all rays). The polynomial is {fitted.lowest:+.3f} to {fitted.highest:+.3f} in line "
         "integral"
     )
@@ -268,10 +268,10 @@ def _fitted(views: _BinnedViews, order: int | None) -> tuple[Background | None, 
         flattened = measured.copy()
         if fitted is not None:
             fitted.remove(flattened, factor=views.factor)
-        inside = radius <= geometry.reach - rim * grid.voxel_size
-        if not inside.any():  # a detector with a few columns has no voxel inside the sample
+        in_field = radius <= geometry.reach - rim * grid.voxel_size
+        if not in_field.any():  # a detector with a few columns has no voxel inside the sample
             return None, (np.zeros(grid.shape, np.bool_), grid)
-        sample = near_material(first_volume(flattened, subset, grid).data, inside)
+        sample = near_material(first_volume(flattened, subset, grid).data, in_field)
         fitted = views.sums(sample, grid, np.arange(n) if round_number else numbers).fit(order)
         if fitted is None:
             break

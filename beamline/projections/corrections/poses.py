@@ -225,9 +225,9 @@ def _of_vectors(table: PoseTable, scan: SelectedScan) -> Geometry:
     except ValueError as error:
         raise DataError(f"{table.path}: {error}. Nothing was read.") from error
     if table.cone != (selection.cone is not None):
-        need = f"give --cone {views.sod:.6g}:{views.sdd:.6g}" if table.cone else "give vectors with src_x to v_z"
+        advice = f"give --cone {views.sod:.6g}:{views.sdd:.6g}" if table.cone else "give vectors with src_x to v_z"
         beam = "a cone" if table.cone else "a parallel beam"
-        raise ConfigError(f"{table.path} has vectors of {beam}, but {source.path} has another beam: {need}.")
+        raise ConfigError(f"{table.path} has vectors of {beam}, but {source.path} has another beam: {advice}.")
     size = selection.pixel_size_mm
     if size is None or abs(size - views.pixel_pitch) > _SAME_SIZE * size:
         stated = "does not state its pixel size" if size is None else f"has pixels of {1e3 * size:.6g} um"
@@ -281,8 +281,8 @@ def _rows_of_frames(table: PoseTable, source: ScanSource, frames: I64) -> I64:
         row_of_frame[views[agrees]] = order[nearest[agrees]]
     else:
         frame_of_key = views if table.by == "view" else np.arange(n)
-        if (beyond := table.keys >= frame_of_key.size).any():
-            number = table.keys[beyond][0]
+        if (is_beyond_end := table.keys >= frame_of_key.size).any():
+            number = table.keys[is_beyond_end][0]
             raise DataError(
                 f"{table.path} states {table.by} {number:g}, but {source.path} has {frame_of_key.size} {table.by}s, "
                 "counted from 0."
@@ -304,23 +304,23 @@ def _rows_of_frames(table: PoseTable, source: ScanSource, frames: I64) -> I64:
 
 def require_stated(poses: ScanPoses, source: ScanSource, view_ids: I64) -> None:
     """Raise DataError if projections have no pose."""
-    unknown, table = view_ids[~poses.stated(view_ids)], poses.table
-    if unknown.size:
-        degrees = np.degrees(source.table.angles[unknown[0]])
-        first_unknown = unknown[0]
+    without_pose, table = view_ids[~poses.stated(view_ids)], poses.table
+    if without_pose.size:
+        degrees = np.degrees(source.table.angles[without_pose[0]])
+        first_without_pose = without_pose[0]
         raise DataError(
-            f"{table.path} has no pose for {unknown.size} of the {view_ids.size} projections chosen from "
-            f"{source.path} (the first: frame {first_unknown}, at {degrees:.6g} degrees). Add the missing poses, or "
-            "use --views to choose only projections that have a pose."
+            f"{table.path} has no pose for {without_pose.size} of the {view_ids.size} projections chosen from "
+            f"{source.path} (the first: frame {first_without_pose}, at {degrees:.6g} degrees). Add the missing poses, "
+            "or use --views to choose only projections that have a pose."
         )
 
 
 def _sentence(table: PoseTable, shifts: F64) -> str:
     if table.vectors is not None:
         return f"The geometry of {count(table.keys.size, 'projection')} comes from the ASTRA vectors in {table.path}."
-    across, down = np.ptp(shifts, axis=0)
+    column_range, row_range = np.ptp(shifts, axis=0)
     roll, tilt = np.abs(table.turns_deg).max(axis=0)
     return (
-        f"{count(table.keys.size, 'pose')} from {table.path}: shifts over {across:.3g} px (columns) and {down:.3g} px "
-        f"(rows), roll up to {roll:.3g}° and tilt up to {tilt:.3g}°."
+        f"{count(table.keys.size, 'pose')} from {table.path}: shifts over {column_range:.3g} px (columns) and "
+        f"{row_range:.3g} px (rows), roll up to {roll:.3g}° and tilt up to {tilt:.3g}°."
     )

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _MOST_TILT_DEG = 45.0
 # number of bands of rows, rows of each band, and number of projections that --tilt auto uses
 _BANDS, _BAND_ROWS, _VIEWS = 16, 4, 240
-_NOTHING = 0.05  # px over the rows: a smaller tilt is not worth an interpolation
+_NEGLIGIBLE_PX = 0.05  # px over the rows: a smaller tilt is not worth an interpolation
 _ROUNDS = 5
 _COPIES = 20  # number of float32 copies of all bands while their axes are searched for
 
@@ -192,15 +192,19 @@ def with_tilt(
             "the tilt with --tilt DEGREES."
         )
     offset_px = abs(tilt) * rows
-    lean = f"The axis is tilted by {tilt_text(tilt, uncertainty)}, {offset_px:.2g} px over {rows} rows"
+    tilt_sentence = f"The axis is tilted by {tilt_text(tilt, uncertainty)}, {offset_px:.2g} px over {rows} rows"
     if uncertainty * rows > MATTERS:
         warn(
             "Check the first and the last slices for double edges, because the tilt is not known to half a "
-            f"pixel. {lean}."
+            f"pixel. {tilt_sentence}."
         )
-    straight = abs(tilt) < 2 * uncertainty or abs(tilt) * rows < _NOTHING
-    step = replace(step, tilt=0.0 if straight else math.degrees(tilt))
-    done = step.done(f"{lean}; not corrected." if straight else f"{lean}; the projections are rotated to correct it.")
+    negligible = abs(tilt) < 2 * uncertainty or abs(tilt) * rows < _NEGLIGIBLE_PX
+    step = replace(step, tilt=0.0 if negligible else math.degrees(tilt))
+    done = step.done(
+        f"{tilt_sentence}; not corrected."
+        if negligible
+        else f"{tilt_sentence}; the projections are rotated to correct it."
+    )
     return scan.with_steps(step), {step.name: done}
 
 
@@ -228,14 +232,16 @@ def _refined(scan: SelectedScan, frames: NDArray[np.int64], progress: BandsDone)
     from beamline.projections.correction import survey
     from beamline.projections.tilt import shown_tilt
 
-    plain, step = _without_blur(scan), scan.selection.step(TiltAndLens)
+    unblurred, step = _without_blur(scan), scan.selection.step(TiltAndLens)
     rows = scan.source.shape[0] / scan.selection.binning
     tilt = 0.0
     for n in range(_ROUNDS):
-        levelled = survey(plain.with_steps(replace(step, tilt=math.degrees(tilt))), frames)
-        residual = shown_tilt(levelled, frames, (_BANDS, _BAND_ROWS), _from(n * _BANDS, _ROUNDS * _BANDS, progress))
+        levelled = survey(unblurred.with_steps(replace(step, tilt=math.degrees(tilt))), frames)
+        residual = shown_tilt(
+            levelled, frames, (_BANDS, _BAND_ROWS), _part_of_progress(n * _BANDS, _ROUNDS * _BANDS, progress)
+        )
         tilt += residual.tilt
-        if abs(residual.tilt) < residual.uncertainty / 4 or abs(residual.tilt) * rows < _NOTHING / 2:
+        if abs(residual.tilt) < residual.uncertainty / 4 or abs(residual.tilt) * rows < _NEGLIGIBLE_PX / 2:
             break
     return tilt, residual.uncertainty
 
@@ -243,11 +249,13 @@ def _refined(scan: SelectedScan, frames: NDArray[np.int64], progress: BandsDone)
 def _without_blur(scan: SelectedScan) -> SelectedScan:
     """The scan without other filters of the projections, because each filter mixes neighbouring pixels."""
     selection = scan.selection
-    sharp = tuple(step for step in selection.steps if isinstance(step, TiltAndLens) or not isinstance(step, ViewStep))
+    steps_without_blur = tuple(
+        step for step in selection.steps if isinstance(step, TiltAndLens) or not isinstance(step, ViewStep)
+    )
     logarithms = replace(selection.step(Preparation), noise="log", gain=None)
-    return scan.part(steps=sharp).with_steps(logarithms)
+    return scan.part(steps=steps_without_blur).with_steps(logarithms)
 
 
-def _from(offset: int, total: int, progress: BandsDone) -> BandsDone:
+def _part_of_progress(offset: int, total: int, progress: BandsDone) -> BandsDone:
     """Report the progress of a part of the work that begins at `offset`."""
     return lambda n, _: progress(offset + n, total)

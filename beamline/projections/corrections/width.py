@@ -135,14 +135,14 @@ class Width:
             if self.arc != "auto":
                 motion = stated
                 if rows_differ and stated.skew:
-                    found = (
+                    obstacle = (
                         "the beam is a cone"
                         if geometry.is_cone
                         else "the projections are rolled or tilted, or will be calibrated for roll or tilt"
                     )
                     raise ConfigError(
                         f"Use --exposure-arc {self.arc.split(':')[0]} instead of {self.arc}: the readout arc (after "
-                        f"the colon) needs a parallel beam without roll or tilt, but {found}. Nothing was written."
+                        f"the colon) needs a parallel beam without roll or tilt, but {obstacle}. Nothing was written."
                     )
             elif abs(stated.arc) * reach_px >= _LEAST_PX:
                 motion = _Motion(stated.arc, 0.0 if rows_differ else stated.skew)

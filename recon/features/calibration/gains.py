@@ -36,10 +36,10 @@ NEAR_AXIS = AT_AXIS
 _BAND, _HALO = 16, 4
 _ONE_IN = 6  # one in this many projections is held out
 _TV_WEIGHT = 1e-3  # with three times this weight, a sixth of a ball on the axis would be removed
-_FIRST, _SWEEPS, _ROUNDS = 8, 4, 4
+_FIRST_SWEEPS, _SWEEPS, _ROUNDS = 8, 4, 4
 # the mean square in held-out projections must fall to this share; see `exceeds_standard_error`
-_BETTER, _SURE = 0.99, 3.0
-_LOOKED_AT = 8  # number of rows that are examined
+_LARGEST_ERROR_RATIO, _STANDARD_ERRORS = 0.99, 3.0
+_EXAMINED_ROWS = 8  # number of rows that are examined
 _BUFFERS = Buffers(8.5, 7.0, 5.0)
 
 
@@ -93,10 +93,10 @@ def learn_gains(
     if not _stripes_seen(projections[:, busiest : busiest + height], geometry):
         return LearntGains(gains, 0.0, 0.0, False)
     lowest = busiest % height - height * (busiest % height > 0)
-    starts = sorted(range(lowest, rows, height), key=lambda start: start != busiest)
-    without = with_gains = np.zeros(1)
-    for done, start in enumerate(starts):
-        progress(done, len(starts))
+    first_rows = sorted(range(lowest, rows, height), key=lambda start: start != busiest)
+    errors_without = errors_with = np.zeros(1)
+    for done, start in enumerate(first_rows):
+        progress(done, len(first_rows))
         inner = slice(max(start, 0), min(start + height, rows))
         outer = slice(max(inner.start - _HALO, 0), min(inner.stop + _HALO, rows))
         band = _Band.of(projections, geometry, outer, measured)
@@ -104,14 +104,16 @@ def learn_gains(
         own = slice(inner.start - outer.start, inner.stop - outer.start)
         gains[inner] = pixels[own]
         if done == 0:
-            plain, _ = band.learn(fitted, gains=False)
-            none = np.zeros_like(pixels)
-            without, with_gains = band.errors(plain, none, unseen, own), band.errors(volume, pixels, unseen, own)
+            volume_without, _ = band.learn(fitted, with_gains=False)
+            no_gains = np.zeros_like(pixels)
+            errors_without = band.errors(volume_without, no_gains, unseen, own)
+            errors_with = band.errors(volume, pixels, unseen, own)
             if not (
-                exceeds_standard_error(without - with_gains, _SURE) and with_gains.mean() < _BETTER * without.mean()
+                exceeds_standard_error(errors_without - errors_with, _STANDARD_ERRORS)
+                and errors_with.mean() < _LARGEST_ERROR_RATIO * errors_without.mean()
             ):
-                return LearntGains(np.zeros_like(gains), _root(without), _root(with_gains), False)
-    return LearntGains(gains, _root(without), _root(with_gains), True)
+                return LearntGains(np.zeros_like(gains), _root(errors_without), _root(errors_with), False)
+    return LearntGains(gains, _root(errors_without), _root(errors_with), True)
 
 
 def gains_memory(geometry: Geometry) -> int:
@@ -125,7 +127,7 @@ def gains_memory(geometry: Geometry) -> int:
 def _stripes_seen(projections: F32, geometry: Geometry) -> bool:
     """Whether some rows [view, row, col] show unequal pixel sensitivities. (A sample can hide them.)"""
     views = np.argsort(geometry.angles, kind="stable")
-    rows = np.arange(0, projections.shape[1], max(1, projections.shape[1] // _LOOKED_AT))
+    rows = np.arange(0, projections.shape[1], max(1, projections.shape[1] // _EXAMINED_ROWS))
     steady = steadiness(projections[np.ix_(views, rows)], geometry.axis_col)
     return steady is None or steady.stripes
 
@@ -155,17 +157,17 @@ class _Band:
         views = geometry if whole else geometry.rows(rows.start, rows.stop)
         return cls(np.ascontiguousarray(projections[:, rows]), views, known)
 
-    def learn(self, view_numbers: NDArray[np.intp], gains: bool = True) -> tuple[Volume, F32]:
+    def learn(self, view_numbers: NDArray[np.intp], with_gains: bool = True) -> tuple[Volume, F32]:
         """The volume from some projections, and the gains [row, col] from its residual."""
         views = self.geometry.select(view_numbers)
         projector = Projector(views, Grid.matching(self.geometry))
         weight = None if self.known is None else np.broadcast_to(self.known, projector.projection_shape).astype("f4")
         decide, gains_so_far, volume = Decisions(), np.zeros(self.data.shape[1:], np.float32), None
         data = self.data[view_numbers]
-        for turn in range(_ROUNDS):
-            method = EarlyTv(_SWEEPS if turn else _FIRST, _TV_WEIGHT)
+        for round_number in range(_ROUNDS):
+            method = EarlyTv(_SWEEPS if round_number else _FIRST_SWEEPS, _TV_WEIGHT)
             volume = solve(method, projector, data, weight=weight, start=volume, decide=decide)
-            if gains and turn + 1 < _ROUNDS:
+            if with_gains and round_number + 1 < _ROUNDS:
                 residual = ring_offsets(data - projector.forward(volume.data), views) * self._distinguished()
                 data -= residual
                 gains_so_far += residual
@@ -180,6 +182,6 @@ class _Band:
 
     def _distinguished(self) -> F32:
         """Weights [col]: 1 in columns in which a gain cannot be confused with a body on the axis."""
-        off = np.abs(np.arange(self.data.shape[2]) - self.geometry.axis_col)
-        still = np.ptp(self.geometry.shifts[:, 0]) < 2 * NEAR_AXIS
-        return np.asarray((off > NEAR_AXIS) | (not still), np.float32)
+        distance = np.abs(np.arange(self.data.shape[2]) - self.geometry.axis_col)
+        axis_at_rest = np.ptp(self.geometry.shifts[:, 0]) < 2 * NEAR_AXIS
+        return np.asarray((distance > NEAR_AXIS) | (not axis_at_rest), np.float32)

@@ -85,10 +85,10 @@ class GeometryChange:
 def knowable(shifts: F64, angles: F64) -> tuple[F64, float]:
     """Shifts [view, 2] without the part that the data cannot determine, and their mean along the columns, which is a
     shift of the axis."""
-    place = np.stack((np.ones_like(angles), np.cos(angles), np.sin(angles)), axis=1)
-    solution = np.linalg.lstsq(place, shifts[:, 0], rcond=None)[0]
-    rest = np.stack((shifts[:, 0] - place @ solution, shifts[:, 1] - shifts[:, 1].mean()), axis=1)
-    return rest, float(solution[0])
+    undetermined_basis = np.stack((np.ones_like(angles), np.cos(angles), np.sin(angles)), axis=1)
+    solution = np.linalg.lstsq(undetermined_basis, shifts[:, 0], rcond=None)[0]
+    remainder = np.stack((shifts[:, 0] - undetermined_basis @ solution, shifts[:, 1] - shifts[:, 1].mean()), axis=1)
+    return remainder, float(solution[0])
 
 
 def slopes(images: F32, geometry: Geometry, tilted: F32 | None, terms: frozenset[str]) -> dict[str, F32]:
@@ -98,17 +98,18 @@ def slopes(images: F32, geometry: Geometry, tilted: F32 | None, terms: frozenset
     Args:
         tilted: derivative with respect to tilt, per radian; None: not needed.
     """
-    across, down = -np.gradient(images, axis=1), -np.gradient(images, axis=2) if images.shape[2] > 1 else 0 * images
+    along_columns = -np.gradient(images, axis=1)
+    along_rows = -np.gradient(images, axis=2) if images.shape[2] > 1 else 0 * images
     by_term: dict[str, F32] = {}
     if "axis" in terms:  # also used if there are shifts, so that one step finds their mean
-        by_term["axis"] = across
+        by_term["axis"] = along_columns
     if "shifts" in terms:
-        by_term |= {"col": across, "row": down}
+        by_term |= {"col": along_columns, "row": along_rows}
     rows, cols = geometry.detector_shape
     if "roll" in terms:
         u = np.arange(cols) - geometry.axis_col - geometry.shifts[:, :1]
         v = np.arange(rows) - geometry.axis_row - geometry.shifts[:, 1:]
-        turned = across * v[:, None, :].astype(np.float32) - down * u[:, :, None].astype(np.float32)
+        turned = along_columns * v[:, None, :].astype(np.float32) - along_rows * u[:, :, None].astype(np.float32)
         by_term["roll"] = np.asarray(turned / edge_motion(geometry), np.float32)
     if tilted is not None:
         by_term["tilt"] = np.asarray(tilted / edge_motion(geometry), np.float32)
@@ -131,21 +132,23 @@ def moved(geometry: Geometry, steps: dict[str, NDArray[np.float64]], farthest: f
         axis += mean
     if "axis" in limited:
         axis += float(limited["axis"][0])
-    turns = {name: float(limited[name][0]) / edge_motion(geometry) for name in ("roll", "tilt") if name in limited}
+    angle_steps = {
+        name: float(limited[name][0]) / edge_motion(geometry) for name in ("roll", "tilt") if name in limited
+    }
     limit = math.radians(30)
     return replace(
         geometry,
         axis_col=axis,
         shifts=shifts,
-        roll=np.clip(geometry.roll + turns.get("roll", 0.0), -limit, limit),
-        tilt=np.clip(geometry.tilt + turns.get("tilt", 0.0), -limit, limit),
+        roll=np.clip(geometry.roll + angle_steps.get("roll", 0.0), -limit, limit),
+        tilt=np.clip(geometry.tilt + angle_steps.get("tilt", 0.0), -limit, limit),
     )
 
 
-_TRIAL = 0.25  # pixels at the image's edge, for the derivative with respect to tilt
-_MARGIN = 3  # additional slices at either end
+_TRIAL_DISPLACEMENT = 0.25  # pixels at the image's edge, for the derivative with respect to tilt
+_MARGIN_SLICES = 3  # additional slices at either end
 # a projection with less than this share of the information in a typical one is not moved, because it shows no material
-_FLOOR = 0.05
+_LEAST_INFORMATION = 0.05
 
 
 @dataclass(eq=False)
@@ -209,7 +212,7 @@ class JointFit:
 
 def taller(grid: Grid) -> Grid:
     """The grid with more slices at either end, for tilted or shifted projections."""
-    return replace(grid, shape=(grid.shape[0] + 2 * _MARGIN, *grid.shape[1:]))
+    return replace(grid, shape=(grid.shape[0] + 2 * _MARGIN_SLICES, *grid.shape[1:]))
 
 
 class _Model:
@@ -238,20 +241,21 @@ class _Model:
     def adjoint(self, images: F32) -> F32:
         volume = self._projector.adjoint_lines(images)
         if self._tilt and not self.geometry.is_cone:
-            moved = np.float32(self._tilt) * _along_rows(images)
-            volume += self._y * self._projector.adjoint_lines(moved * self._cos)
-            volume -= self._x * self._projector.adjoint_lines(moved * self._sin)
+            displaced_images = np.float32(self._tilt) * _along_rows(images)
+            volume += self._y * self._projector.adjoint_lines(displaced_images * self._cos)
+            volume -= self._x * self._projector.adjoint_lines(displaced_images * self._sin)
         return volume
 
     def by_tilt(self, volume: F32) -> F32:
         """The derivative of the images with respect to tilt, per radian."""
         if self.geometry.is_cone:
-            trial = _TRIAL / max(self.geometry.detector_shape)
-            there, back = (
+            trial_tilt = _TRIAL_DISPLACEMENT / max(self.geometry.detector_shape)
+            tilted_forwards, tilted_backwards = (
                 Projector(replace(self.geometry, tilt=self._projector.geometry.tilt + t), self._grid)
-                for t in (trial, -trial)
+                for t in (trial_tilt, -trial_tilt)
             )
-            return (there.forward_lines(volume) - back.forward_lines(volume)) / np.float32(2 * trial)
+            difference = tilted_forwards.forward_lines(volume) - tilted_backwards.forward_lines(volume)
+            return difference / np.float32(2 * trial_tilt)
         by_x, by_y = (self._projector.forward_lines(volume * coordinate) for coordinate in (self._x, self._y))
         return -_along_rows(by_y * self._cos - by_x * self._sin)
 
@@ -259,9 +263,9 @@ class _Model:
 def _along_rows(images: F32) -> F32:
     """Slopes along the rows (central differences of fourth order); 0 outside."""
     out = np.zeros_like(images)
-    for reach, share in ((1, 8 / 12), (2, -1 / 12)):
-        out[..., :-reach] += np.float32(share) * images[..., reach:]
-        out[..., reach:] -= np.float32(share) * images[..., :-reach]
+    for reach, coefficient in ((1, 8 / 12), (2, -1 / 12)):
+        out[..., :-reach] += np.float32(coefficient) * images[..., reach:]
+        out[..., reach:] -= np.float32(coefficient) * images[..., :-reach]
     return out
 
 
@@ -270,8 +274,8 @@ def _turned_back(data: F32, geometry: Geometry) -> F32:
     out = np.empty_like(data)
     for view in range(len(data)):
         c, s = math.cos(geometry.roll[view]), math.sin(geometry.roll[view])
-        turn, origin = np.array([[c, s], [-s, c]]), np.array(geometry.origin(view))
-        out[view] = ndimage.affine_transform(data[view], turn, origin - turn @ origin, mode="nearest")
+        rotation, origin = np.array([[c, s], [-s, c]]), np.array(geometry.origin(view))
+        out[view] = ndimage.affine_transform(data[view], rotation, origin - rotation @ origin, mode="nearest")
     return out
 
 
@@ -289,19 +293,19 @@ def _solved(
     """The change of the volume and of each quantity that may change: [view] for positions of projections, [1] for the
     others."""
     first = model.adjoint(weighed(residual))
-    shown = model.forward(first)
-    typical = float(np.vdot(shown, weighed(shown)) / max(float(np.vdot(first, first)), 1e-30))
+    projected = model.forward(first)
+    typical = float(np.vdot(projected, weighed(projected)) / max(float(np.vdot(first, first)), 1e-30))
     scale: dict[str, NDArray[np.float64]] = {}
     for name, slope in free.items():
         information = np.einsum("vcr,vcr->v", slope, weighed(slope)).astype(np.float64)
         information = (
-            np.maximum(information, _FLOOR * np.median(information))
+            np.maximum(information, _LEAST_INFORMATION * np.median(information))
             if name in ("col", "row")
             else information.sum(keepdims=True)
         )
         scale[name] = np.sqrt(typical / np.maximum(information, 1e-30))
 
-    def back(images: F32) -> tuple[F32, dict[str, F64]]:
+    def transpose(images: F32) -> tuple[F32, dict[str, F64]]:
         values = {}
         for name, slope in free.items():
             each = np.einsum("vcr,vcr->v", slope, images).astype(np.float64)
@@ -311,27 +315,27 @@ def _solved(
     def dot(a: tuple[F32, dict[str, F64]]) -> float:
         return float(np.vdot(a[0], a[0])) + sum(float(v @ v) for v in a[1].values())
 
-    y, c = np.zeros_like(first), {name: np.zeros(s.size) for name, s in scale.items()}
-    gradient = back(weighed(residual))
-    along = gradient[0].copy(), {name: v.copy() for name, v in gradient[1].items()}
-    size = dot(gradient)
+    volume_change, term_changes = np.zeros_like(first), {name: np.zeros(s.size) for name, s in scale.items()}
+    gradient = transpose(weighed(residual))
+    direction = gradient[0].copy(), {name: v.copy() for name, v in gradient[1].items()}
+    squares = dot(gradient)
     for _ in range(rounds):
-        if size == 0:
+        if squares == 0:
             break
-        image = model.forward(along[0])
+        image = model.forward(direction[0])
         for name, slope in free.items():
-            image += slope * (scale[name] * along[1][name]).astype(np.float32)[:, None, None]
-        pulled = weighed(image)
-        far = size / max(float(np.vdot(image, pulled)), 1e-30)
-        y += np.float32(far) * along[0]
-        change = back(pulled)
-        for name in c:
-            c[name] += far * along[1][name]
-            gradient[1][name] -= far * change[1][name]
-        gradient = gradient[0] - np.float32(far) * change[0], gradient[1]
-        before, size = size, dot(gradient)
-        along = (
-            gradient[0] + np.float32(size / before) * along[0],
-            {name: gradient[1][name] + size / before * along[1][name] for name in c},
+            image += slope * (scale[name] * direction[1][name]).astype(np.float32)[:, None, None]
+        weighed_image = weighed(image)
+        step_length = squares / max(float(np.vdot(image, weighed_image)), 1e-30)
+        volume_change += np.float32(step_length) * direction[0]
+        change = transpose(weighed_image)
+        for name in term_changes:
+            term_changes[name] += step_length * direction[1][name]
+            gradient[1][name] -= step_length * change[1][name]
+        gradient = gradient[0] - np.float32(step_length) * change[0], gradient[1]
+        last_squares, squares = squares, dot(gradient)
+        direction = (
+            gradient[0] + np.float32(squares / last_squares) * direction[0],
+            {name: gradient[1][name] + squares / last_squares * direction[1][name] for name in term_changes},
         )
-    return y, {name: scale[name] * value for name, value in c.items()}
+    return volume_change, {name: scale[name] * value for name, value in term_changes.items()}

@@ -27,10 +27,10 @@ from recon.voxels.methods import EarlyTv
 
 _ONE_IN = 4  # one in this many projections is held out
 _SWEEPS, _TV_WEIGHT = 6, 3e-3
-_EDGE = 1  # number of rows at either end in which rays of tilted projections leave the reconstructed slices
-_SMOOTH = 4.0  # pixels
-_LEAST = 0.002  # a better geometry must lower the squared deviation by at least this share
-_SURE = 2.0  # see `exceeds_standard_error`
+_EDGE_ROWS = 1  # number of rows at either end in which rays of tilted projections leave the reconstructed slices
+_SMOOTHING_PX = 4.0  # pixels
+_LEAST_IMPROVEMENT = 0.002  # a better geometry must lower the squared deviation by at least this share
+_STANDARD_ERRORS = 2.0  # see `exceeds_standard_error`
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Judge:
         weights = None if self.known is None else np.broadcast_to(self.known, self.views.shape)
         unseen, images = predicted_views(method, Views(self.views, geometry, weights), self.grid, _ONE_IN)
         known = np.ones(images.shape[1:], np.float32) if self.known is None else self.known.copy()
-        edge = min(_EDGE, (rows - 1) // 4)
+        edge = min(_EDGE_ROWS, (rows - 1) // 4)
         known[:edge], known[rows - edge :] = 0, 0
         return np.array(
             [self._left(view - image, image, known) for view, image in zip(self.views[unseen], images, strict=True)]
@@ -66,8 +66,8 @@ class Judge:
         """Root mean square residual of a projection after it was shifted to the position at which it agrees best."""
         rays = _without_smooth(residual)[known > 0]
         if self.placed:
-            ways = [_without_smooth(np.gradient(image, axis=axis)) for axis in (0, 1) if image.shape[axis] > 1]
-            slopes = np.stack([way[known > 0] for way in ways], axis=1)
+            image_slopes = [_without_smooth(np.gradient(image, axis=axis)) for axis in (0, 1) if image.shape[axis] > 1]
+            slopes = np.stack([image_slope[known > 0] for image_slope in image_slopes], axis=1)
             rays = rays - slopes @ np.linalg.lstsq(slopes, rays, rcond=1e-6)[0]
         return float(np.sqrt(np.mean(rays**2)))
 
@@ -75,24 +75,24 @@ class Judge:
 def _without_smooth(image: F32) -> F64:
     """Differences of pixels from their surroundings. An air level and material outside the field of view are smooth, so
     the differences do not contain them."""
-    return np.asarray(image - gaussian_filter(image, _SMOOTH, mode="nearest"), np.float64)
+    return np.asarray(image - gaussian_filter(image, _SMOOTHING_PX, mode="nearest"), np.float64)
 
 
 def better(residuals: F64, reference_residuals: F64) -> bool:
     """Whether the first deviations [view] are significantly smaller than the second deviations, given their scatter."""
     share: NDArray[np.float64] = 1 - np.square(residuals) / np.maximum(np.square(reference_residuals), 1e-30)
-    return bool(share.mean() > _LEAST) and exceeds_standard_error(share, _SURE)
+    return bool(share.mean() > _LEAST_IMPROVEMENT) and exceeds_standard_error(share, _STANDARD_ERRORS)
 
 
 COLS, ROWS = 320, 96  # this many pixels are enough to determine the geometry; more pixels would take longer
 LEAST_VIEWS = 12
-_FEWEST = 20  # fewest columns at the coarsest level
+_LEAST_COLS = 20  # fewest columns at the coarsest level
 # the axis is fitted alone first; if it is wrong by much, single projections would move instead of it
 _AXIS_STEPS, _AXIS_ROUNDS = 4, 8
 _STEPS = 6, 4, 3  # Gauss-Newton steps per level, from coarse to fine
 _ROUNDS = 16  # conjugate-gradient iterations in each step
-_FARTHEST = 2.0  # largest move in a step, in binned pixels
-_NOTHING = 0.03  # pixels of the given projections, at the image's edge; smaller changes are dropped
+_LARGEST_MOVE = 2.0  # largest move in a step, in binned pixels
+_LEAST_CHANGE = 0.03  # pixels of the given projections, at the image's edge; smaller changes are dropped
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,11 +176,11 @@ def learn_geometry(
         fit.step(_AXIS_ROUNDS, 0.0)
         if factor == factors[0] and "axis" in terms:
             for _ in range(_AXIS_STEPS):
-                fit.step(_AXIS_ROUNDS, _FARTHEST)
+                fit.step(_AXIS_ROUNDS, _LARGEST_MOVE)
                 tick()
         fit.terms = terms
         for _ in range(count):
-            fit.step(_ROUNDS, _FARTHEST)
+            fit.step(_ROUNDS, _LARGEST_MOVE)
             tick()
         learnt = GeometryChange.between(small, fit.geometry).scaled(factor).applied(learnt)
     return _confirmed(
@@ -191,8 +191,8 @@ def learn_geometry(
 def _factors(rows: int, cols: int) -> list[int]:
     """Binning factors of the levels, from coarse to fine."""
     # binned pixels are fine enough to determine a shift to a hundredth of a pixel
-    finest = 2 if cols >= 2 * _FEWEST and rows > 1 else 1
-    factors = [f for f in (8, 4, 2, 1) if f >= finest and cols // f >= _FEWEST and rows // f >= 1]
+    finest = 2 if cols >= 2 * _LEAST_COLS and rows > 1 else 1
+    factors = [f for f in (8, 4, 2, 1) if f >= finest and cols // f >= _LEAST_COLS and rows // f >= 1]
     return factors[-len(_STEPS) :] or [1]
 
 
@@ -211,50 +211,50 @@ def _confirmed(
     tick: Callable[[], None],
 ) -> LearntGeometry:
     """The part of a change that held-out projections confirm: first the whole change, then each term of it."""
-    small, data = geometry.binned(factor), bin_views(projections, factor)
+    binned, data = geometry.binned(factor), bin_views(projections, factor)
     edge = edge_motion(geometry)
     sizes = abs(change.axis), abs(change.roll) * edge, abs(change.tilt) * edge, float(np.abs(change.shifts).max())
-    wanted = [term for term, size in zip(TERMS, sizes, strict=True) if size > _NOTHING]
+    large_terms = [term for term, size in zip(TERMS, sizes, strict=True) if size > _LEAST_CHANGE]
     judge = Judge(
         data,
-        taller(Grid.matching(small)),
+        taller(Grid.matching(binned)),
         None if known is None else bin_views(known[None], factor)[0],
-        "shifts" in wanted,
+        "shifts" in large_terms,
     )
 
     def judged(terms: list[str]) -> NDArray[np.float64]:
         tick()
-        return judge.deviations(change.of(frozenset(terms)).scaled(1 / factor).applied(small))
+        return judge.deviations(change.of(frozenset(terms)).scaled(1 / factor).applied(binned))
 
-    before, groups = judged([]), _groups(wanted)
-    confirmed, after = list(wanted), judged(wanted) if wanted else before
-    if not better(after, before):
-        confirmed, after = [], before
+    without_change, groups = judged([]), _groups(large_terms)
+    confirmed, with_confirmed = list(large_terms), judged(large_terms) if large_terms else without_change
+    if not better(with_confirmed, without_change):
+        confirmed, with_confirmed = [], without_change
         for group in groups if len(groups) > 1 else []:
             alone = judged(group)
-            if better(alone, after):
-                confirmed, after = group, alone
+            if better(alone, with_confirmed):
+                confirmed, with_confirmed = group, alone
     elif len(groups) > 1:
         for group in groups:
-            rest = [term for term in confirmed if term not in group]
-            without = judged(rest)
-            if not better(after, without):
-                confirmed, after = rest, without
-    dropped = [term for term in wanted if term not in confirmed]
+            other_terms = [term for term in confirmed if term not in group]
+            without_group = judged(other_terms)
+            if not better(with_confirmed, without_group):
+                confirmed, with_confirmed = other_terms, without_group
+    dropped = [term for term in large_terms if term not in confirmed]
     return LearntGeometry(
         change.of(frozenset(confirmed)),
         tuple(confirmed),
         tuple(dropped),
-        float(np.median(before)),
-        float(np.median(after)),
+        float(np.median(without_change)),
+        float(np.median(with_confirmed)),
     )
 
 
 def _groups(terms: list[str]) -> list[list[str]]:
     """Groups of terms that are confirmed together. Axis and shifts are one group, because a shift of the axis is the
     mean of the shifts."""
-    places = [term for term in terms if term in ("axis", "shifts")]
-    return [group for group in (places, *([term] for term in terms if term not in places)) if group]
+    position_terms = [term for term in terms if term in ("axis", "shifts")]
+    return [group for group in (position_terms, *([term] for term in terms if term not in position_terms)) if group]
 
 
 def _text(change: GeometryChange, term: str, binning: int) -> str:

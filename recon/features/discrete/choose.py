@@ -36,7 +36,7 @@ the user gives are pulled to weakly if no projections can be held out.
 COUNTS = (2, 3)
 """Numbers of levels that are tried (air may be one of them); four are tried if three are best."""
 _LEAST_SHARE = 1 / 16  # smallest share of the weight of total variation
-_HEAVIER = 1.75
+_SHARE_FACTOR = 1.75
 """Factor on the share of total variation that predicts the held-out projections best.
 
 In the PSNR, the ground truth prefers 1.5 to 2 times that share. With 1.5 instead of 2, 16 scans of 192 and 512 columns
@@ -158,25 +158,29 @@ class MaterialTrial:
         """Choose the share of total variation; returns its residuals and levels, and the share.
 
         The share is halved from 1 down to `least_share` as long as half the share predicts better by `LEAST_GAIN`. Then
-        the vertex of the parabola through the best share and its neighbours is taken. The result is `_HEAVIER` times
-        that vertex. If the sample is wider than the field of view, it is the best share itself.
+        the vertex of the parabola through the best share and its neighbours is taken. The result is `_SHARE_FACTOR`
+        times that vertex. If the sample is wider than the field of view, it is the best share itself.
         """
-        count, tried = len(chosen.levels), {chosen.tv_share: (best, chosen)}
+        count, trials = len(chosen.levels), {chosen.tv_share: (best, chosen)}
 
         def trial_of(tv_share: float) -> tuple[F64, MaterialPrior]:
-            if tv_share not in tried:
-                tried[tv_share] = self._tried(count, tv_share)
-            return tried[tv_share]
+            if tv_share not in trials:
+                trials[tv_share] = self._tried(count, tv_share)
+            return trials[tv_share]
 
         share = 1.0
         while share > least_share and significantly_better(trial_of(share / 2)[0], trial_of(share)[0], LEAST_GAIN):
             share /= 2
-        lighter, own, heavier = (
+        lighter, middle, heavier = (
             float(trial_of(each)[0].mean()) for each in (max(share / 2, least_share), share, 2 * share)
         )
-        below, above = lighter - own, heavier - own
-        octaves = float(np.clip((below - above) / (2 * (below + above)), -0.5, 0.5)) if below + above > 0 else 0.0
-        return *trial_of(share), max(share if self._trial.wide else share * _HEAVIER * 2.0**octaves, least_share)
+        lighter_excess, heavier_excess = lighter - middle, heavier - middle
+        octaves = (
+            float(np.clip((lighter_excess - heavier_excess) / (2 * (lighter_excess + heavier_excess)), -0.5, 0.5))
+            if lighter_excess + heavier_excess > 0
+            else 0.0
+        )
+        return *trial_of(share), max(share if self._trial.wide else share * _SHARE_FACTOR * 2.0**octaves, least_share)
 
     def _better(self, best: F64, chosen: MaterialPrior, count: int, tv_share: float) -> tuple[F64, MaterialPrior]:
         """This candidate if it predicts significantly better, otherwise the best one so far."""
@@ -189,21 +193,21 @@ class MaterialTrial:
         """Residuals [view] of a test reconstruction, and its levels; infinite and none if there are fewer levels or the
         tests were stopped.
         """
-        none = np.full(self.smooth.shape, np.inf), MaterialPrior()
+        no_result = np.full(self.smooth.shape, np.inf), MaterialPrior()
         if self._trial.ended:
-            return none
+            return no_result
         levels, weights = (
             fitted_levels(self._start[self._where], count)
             if self._levels is None
             else (np.array(self._levels), np.full(count, 1 / count))
         )
         if self._levels is None and not are_apart(levels):
-            return none
-        first = MaterialPrior(tuple(levels.tolist()), tuple(weights.tolist()), tv_share, pull, NOISE)
+            return no_result
+        prior = MaterialPrior(tuple(levels.tolist()), tuple(weights.tolist()), tv_share, pull, NOISE)
         none_thin, noise = np.broadcast_to(np.int8(0), self._start.shape), min(NOISE, LEAST_NOISE / math.sqrt(tv_share))
-        towards = MaterialPull(first._replace(noise=noise), self._where, none_thin, follows=self._levels is None)
-        x = self._volume_by(towards)
-        return self._trial.residuals(x), towards.materials_in(x)._replace(noise=NOISE)
+        material_pull = MaterialPull(prior._replace(noise=noise), self._where, none_thin, follows=self._levels is None)
+        x = self._volume_by(material_pull)
+        return self._trial.residuals(x), material_pull.materials_in(x)._replace(noise=NOISE)
 
     def _volume_by(self, pull: MaterialPull) -> F32:
         """The volume of total variation that is pulled to these levels."""

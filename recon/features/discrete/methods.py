@@ -41,7 +41,7 @@ _TRIALS = 7  # usual number of test reconstructions with levels
 # Number of them after which levels are rejected for the voxel refinement of a fit, usually at most: the numbers of
 # levels, two more shares of total variation, a weaker pull, and further iterations of total variation. (2, if total
 # variation alone predicts better.)
-_REJECTED = len(COUNTS) + 4
+_TRIALS_TO_REJECT = len(COUNTS) + 4
 
 # the reason that a volume without levels states
 _NO_LEVELS = (
@@ -107,7 +107,7 @@ class Discrete(HalfVoxels):
         """Usual largest number of iterations of the tests that may reject discrete levels for the voxel refinement of a
         Gaussian fit. After a rejection of discrete levels, PnP-DCT may be tried.
         """
-        return _REJECTED * self.usual_sweeps
+        return _TRIALS_TO_REJECT * self.usual_sweeps
 
     @classmethod
     def probabilities(cls, volume: Volume, settings: Mapping[str, Any]) -> F32 | None:
@@ -168,14 +168,16 @@ class Discrete(HalfVoxels):
             return x
         if materials is None:
             return without_levels.in_half_voxels(problem, x, mu, TV_STEPS)
-        before = 0 if problem.decide.ended is None else problem.decide.ended.after
+        sweeps_before = 0 if problem.decide.ended is None else problem.decide.ended.after
         x = self.pulled(problem, x, weight, materials, self.first_sweeps)
         if (ended := problem.decide.ended) is not None:
-            problem.decide.ended = ended._replace(after=before + ended.after)
+            problem.decide.ended = ended._replace(after=sweeps_before + ended.after)
         if not problem.go_on.going:
             return x
         pull = partial(pull_to, materials)
-        return self.in_half_voxels(problem, x, mu * materials.tv_share, TV_STEPS, pull, self.first_sweeps - before)
+        return self.in_half_voxels(
+            problem, x, mu * materials.tv_share, TV_STEPS, pull, self.first_sweeps - sweeps_before
+        )
 
     def materials(
         self, problem: VoxelProblem, weight: TvWeight, trial: Callable[[], Trial | None]

@@ -81,23 +81,23 @@ def fitted_levels(values: F32, count: int) -> tuple[F64, F64]:
     such as air around a sample, do not count. With 90 projections they moved the lower of two levels from 0.28 to 0.24
     of the upper one.
     """
-    few = some_values(values, _LOOKED_AT)
-    few = few[few >= EMPTY * np.percentile(few, 99.5)]
-    counts, edges = np.histogram(few, _BINS, range=tuple(np.percentile(few, (0.05, 99.95))))
+    sampled = some_values(values, _LOOKED_AT)
+    sampled = sampled[sampled >= EMPTY * np.percentile(sampled, 99.5)]
+    counts, edges = np.histogram(sampled, _BINS, range=tuple(np.percentile(sampled, (0.05, 99.95))))
     middles, quantiles = (edges[1:] + edges[:-1]) / 2, (np.arange(count) + 0.5) / count
-    mean = np.quantile(few, quantiles if count > 2 else (0.1, 0.9)).astype(float)
+    mean = np.quantile(sampled, quantiles if count > 2 else (0.1, 0.9)).astype(float)
     span, weight = float(np.ptp(middles)), np.full(count + 1, 1 / (count + 1))
     deviation = np.full(count, span / 6)
     for _ in range(_ROUNDS):
-        z = (middles - mean[:, None]) / deviation[:, None]
-        normal = weight[:count, None] / deviation[:, None] * np.exp(-0.5 * z**2)
-        inside = (middles > mean.min()) & (middles < mean.max())
-        flat = weight[count] * math.sqrt(2 * math.pi) * inside / (np.ptp(mean) + 1e-6 * span) + 1e-12 / span
+        normalised = (middles - mean[:, None]) / deviation[:, None]
+        normal = weight[:count, None] / deviation[:, None] * np.exp(-0.5 * normalised**2)
+        between_levels = (middles > mean.min()) & (middles < mean.max())
+        flat = weight[count] * math.sqrt(2 * math.pi) * between_levels / (np.ptp(mean) + 1e-6 * span) + 1e-12 / span
         share = np.vstack((normal, flat))
         share *= counts / share.sum(0)
-        n = share.sum(1) + 1e-9
-        weight, mean = n / n.sum(), share[:count] @ middles / n[:count]
-        deviation = np.sqrt((share[:count] * (middles - mean[:, None]) ** 2).sum(1) / n[:count])
+        class_sizes = share.sum(1) + 1e-9
+        weight, mean = class_sizes / class_sizes.sum(), share[:count] @ middles / class_sizes[:count]
+        deviation = np.sqrt((share[:count] * (middles - mean[:, None]) ** 2).sum(1) / class_sizes[:count])
         deviation = deviation.clip(1e-3 * span, max(0.15 * float(np.ptp(mean)), 1e-3 * span))
     order = np.argsort(mean)
     return mean[order], weight[:count][order] / weight[:count].sum()
@@ -105,9 +105,9 @@ def fitted_levels(values: F32, count: int) -> tuple[F64, F64]:
 
 def undecided_share(x: F32, materials: MaterialPrior) -> float:
     """Expected share of misclassified voxels (wrong side of the middle between two levels), from a sample of x."""
-    few, levels = some_values(x, _LOOKED_AT), materials.levels
-    off = [np.abs(few - (high + low) / 2) / (high - low) for low, high in pairwise(levels)]
-    return float(ndtr(-np.min(off, axis=0) / DOUBT).mean())
+    sampled, levels = some_values(x, _LOOKED_AT), materials.levels
+    distances = [np.abs(sampled - (high + low) / 2) / (high - low) for low, high in pairwise(levels)]
+    return float(ndtr(-np.min(distances, axis=0) / DOUBT).mean())
 
 
 def are_apart(levels: F64) -> bool:
@@ -132,30 +132,30 @@ def thin_parts(x: F32, materials: MaterialPrior) -> NDArray[np.int8]:
 
     Memory: briefly four volumes of x [y, x, z].
     """
-    less, more = grey_closing(x, 3) - x, x - grey_opening(x, 3)
-    thin = np.sign(less - more).astype(np.int8)
-    thin[np.maximum(less, more) <= THIN * gap_of(materials)] = 0
+    missing_density, excess_density = grey_closing(x, 3) - x, x - grey_opening(x, 3)
+    thin = np.sign(missing_density - excess_density).astype(np.int8)
+    thin[np.maximum(missing_density, excess_density) <= THIN * gap_of(materials)] = 0
     return thin
 
 
 def table_of(materials: MaterialPrior) -> MaterialTable:
     """The table of these materials for the kernel."""
-    m, weight = np.array(materials.levels), np.array(materials.weights)
-    gaps, spread = np.diff(m), SPREAD * gap_of(materials)
+    levels, weight = np.array(materials.levels), np.array(materials.weights)
+    gaps, spread = np.diff(levels), SPREAD * gap_of(materials)
     variance = (materials.noise * gap_of(materials)) ** 2 + spread**2
-    beyond = _REACH * math.sqrt(variance)
-    values = np.linspace(m[0] - beyond, m[-1] + beyond, _ROWS)
-    likelihoods = np.exp(-0.5 * (values[:, None] - m) ** 2 / variance) / math.sqrt(2 * math.pi * variance)
-    own, part = 0.5 * weight * likelihoods, 0.5 / gaps.size / gaps * np.ones((_ROWS, 1))
-    whole = own.sum(1, keepdims=True) + part.sum(1, keepdims=True)
-    up = np.clip((values[:, None] - m[:-1]) / gaps, 0, 1)
-    shares = own / whole
-    shares[:, :-1] += part / whole * (1 - up)
-    shares[:, 1:] += part / whole * up
-    kept = np.full(m.size, spread**2 / variance, np.float32)
+    margin = _REACH * math.sqrt(variance)
+    values = np.linspace(levels[0] - margin, levels[-1] + margin, _ROWS)
+    likelihoods = np.exp(-0.5 * (values[:, None] - levels) ** 2 / variance) / math.sqrt(2 * math.pi * variance)
+    pure, partial = 0.5 * weight * likelihoods, 0.5 / gaps.size / gaps * np.ones((_ROWS, 1))
+    total = pure.sum(1, keepdims=True) + partial.sum(1, keepdims=True)
+    place_in_gap = np.clip((values[:, None] - levels[:-1]) / gaps, 0, 1)
+    shares = pure / total
+    shares[:, :-1] += partial / total * (1 - place_in_gap)
+    shares[:, 1:] += partial / total * place_in_gap
+    kept_share = np.full(levels.size, spread**2 / variance, np.float32)
     step = float(values[1] - values[0])
     return MaterialTable(
-        shares.astype(np.float32), likelihoods.astype(np.float32), m.astype(np.float32), kept,
+        shares.astype(np.float32), likelihoods.astype(np.float32), levels.astype(np.float32), kept_share,
         (1 / gaps).astype(np.float32), float(values[0]), 1 / step, *PARTIAL,
     )  # fmt: skip
 
@@ -191,8 +191,8 @@ class MaterialPull:
     def target(self, x: F32) -> F32:
         z = np.empty_like(x)
         posterior_mean(x, table_of(self.materials_in(x)), z)
-        for pulled, own, where, thin in zip(z, x, self.where, self.thin, strict=True):
-            np.copyto(pulled, own, where=~where | ((pulled - own) * thin > 0))
+        for pulled, own, is_pulled, thin in zip(z, x, self.where, self.thin, strict=True):
+            np.copyto(pulled, own, where=~is_pulled | ((pulled - own) * thin > 0))
         return z
 
 

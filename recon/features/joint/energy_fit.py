@@ -28,7 +28,7 @@ _SUBSETS, _TV_STEPS = 9, 3
 _ROUNDS = 6  # number of power iterations
 # the energies do not separate the materials if a singular value is below this share of the largest one
 _LEAST_SINGULAR = 1e-4
-_NOTHING = 1e-20  # largest singular value that counts as zero: the materials do not attenuate
+_ZERO_SINGULAR = 1e-20  # largest singular value that counts as zero: the materials do not attenuate
 
 
 def refuse_alike(cross_sections: F64) -> None:
@@ -37,7 +37,7 @@ def refuse_alike(cross_sections: F64) -> None:
     if not np.isfinite(cross_sections).all():
         raise ValueError("cross_sections must be finite")
     values = np.linalg.svd(cross_sections, compute_uv=False)
-    if n < materials or values[-1] <= max(_LEAST_SINGULAR * values[0], _NOTHING):
+    if n < materials or values[-1] <= max(_LEAST_SINGULAR * values[0], _ZERO_SINGULAR):
         raise ValueError(
             f"cannot separate {materials} materials with {n} {'energy' if n == 1 else 'energies'}: use more energies, "
             "energies at which the materials differ more, or fewer materials"
@@ -250,7 +250,7 @@ class EnergyFit:
         for sweep in range(n):
             squares = 0.0
             order = [number for _ in range(_SUBSETS // count) for number in self.rng.permutation(count)]
-            for turn, number in enumerate(order):
+            for step_number, number in enumerate(order):
                 try:
                     squares += self.descent(self.subsets[number], descent)
                 except StoppedError:
@@ -262,7 +262,7 @@ class EnergyFit:
                     near(component, float(weight) * self.step / count)
                     near.turn()
                 nonnegative_mix(self.z, self._back, self._to)
-                if turn + 1 < len(order):
+                if step_number + 1 < len(order):
                     ahead(self.z)
             yield math.sqrt(squares * count / len(order)) / self._norm
             if sweep + 1 < n:

@@ -27,10 +27,10 @@ from recon.voxels.projector import Projector, projection_lines, volume_lines
 _COARSEST = 12  # smallest number of voxels across at the first level; at each following level, voxels are half as wide
 # up to this many pixels across, the last level has one voxel per pixel; with more pixels, one voxel per two pixels
 _FINE = 96
-_TURNS = 6, 4, 2  # number of alternations at each level; further levels have the last number
+_ALTERNATIONS = 6, 4, 2  # number of alternations at each level; further levels have the last number
 SWEEPS_OF_TURN = 6  # iterations in an alternation; they continue from the volume of the previous one
 _KNOTS, _CONTROLS = 3, 3  # number of control points of the motion: in time, and along each axis
-_HEAVIER = 2.0  # factor on the weight of total variation, because one volume for all times has less detail
+_WEIGHT_FACTOR = 2.0  # factor on the weight of total variation, because one volume for all times has less detail
 JUDGED, JUDGED_SWEEPS = 48, 24  # voxels across of the test volumes that decide about motion, and their iterations
 _BLOCKS, _ONE_BLOCK_IN = 32, 4  # blocks in time; one in this many is held out (eight blocks)
 
@@ -41,7 +41,7 @@ def levels(cols: int) -> list[tuple[int, int]]:
     widths = [last]
     while cols // (2 * widths[0]) >= _COARSEST:
         widths.insert(0, 2 * widths[0])
-    return [(width, _TURNS[min(n, len(_TURNS) - 1)]) for n, width in enumerate(widths)]
+    return [(width, _ALTERNATIONS[min(n, len(_ALTERNATIONS) - 1)]) for n, width in enumerate(widths)]
 
 
 class OfMoments(NamedTuple):
@@ -77,27 +77,29 @@ def unseen_squares(
     """
     block = fine.views.energy * _BLOCKS // len(fine.views.cross_sections)
     held_out = block % _ONE_BLOCK_IN == _ONE_BLOCK_IN // 2
-    used, follow = np.flatnonzero(~held_out), 2 * JUDGED_SWEEPS
+    used, remaining = np.flatnonzero(~held_out), 2 * JUDGED_SWEEPS
     fitted = coarse._replace(views=coarse.views.select(used, slice(None)))
-    motion = learnt_motion(fitted, lambda sweep, residual: go_on(sweep - follow, residual), stop)
+    motion = learnt_motion(fitted, lambda sweep, residual: go_on(sweep - remaining, residual), stop)
     if motion is None:
         return None
     views = _binned(fine.views, round(fine.views.geometry.detector_shape[1] / JUDGED))
     grid, squares_of_fits = Grid.matching(views.geometry), []
     nz, ny, nx = grid.shape
-    for now in (None, motion.on((ny, nx, nz), fine.times)):
-        fit = EnergyFit(views.select(used, slice(None)), grid, np.random.default_rng(0), now, stop)
+    for tested_motion in (None, motion.on((ny, nx, nz), fine.times)):
+        fit = EnergyFit(views.select(used, slice(None)), grid, np.random.default_rng(0), tested_motion, stop)
         for residual in fit.sweeps(fine.weights, JUDGED_SWEEPS):
-            follow -= 1
-            if not go_on(-follow, residual):
+            remaining -= 1
+            if not go_on(-remaining, residual):
                 return None
         if stop():
             return None
-        squares_of_fits.append(_residual_squares(views, fit.densities(), now, grid))
+        squares_of_fits.append(_residual_squares(views, fit.densities(), tested_motion, grid))
     numbers = np.unique(block[held_out])
     of_blocks = np.array([[squares[block == number].sum() for number in numbers] for squares in squares_of_fits])
-    own = _residual_squares(views, np.zeros_like(fit.densities()), None, grid)[held_out].sum() / numbers.size
-    return of_blocks / (own or 1.0)
+    squares_of_data = (
+        _residual_squares(views, np.zeros_like(fit.densities()), None, grid)[held_out].sum() / numbers.size
+    )
+    return of_blocks / (squares_of_data or 1.0)
 
 
 def _residual_squares(views: EnergyViews, densities: F32, motion: Motion | None, grid: Grid) -> F64:
@@ -106,10 +108,10 @@ def _residual_squares(views: EnergyViews, densities: F32, motion: Motion | None,
     weight = None if views.weight is None else projection_lines(views.weight)
     squares = np.empty(len(data))
     for view, moment in enumerate(views.energy.tolist()):
-        now = volume_lines(np.tensordot(views.cross_sections[moment].astype(np.float32), densities, 1))
-        image = projector.subset([view]).forward_lines(moved(now, None if motion is None else motion.at(moment)))
-        off = data[view : view + 1] - image
-        squares[view] = np.vdot(off, weighed(off, None if weight is None else weight[view : view + 1]))
+        density = volume_lines(np.tensordot(views.cross_sections[moment].astype(np.float32), densities, 1))
+        image = projector.subset([view]).forward_lines(moved(density, None if motion is None else motion.at(moment)))
+        difference = data[view : view + 1] - image
+        squares[view] = np.vdot(difference, weighed(difference, None if weight is None else weight[view : view + 1]))
     return squares
 
 
@@ -125,20 +127,20 @@ def learnt_motion(
     """
     views, times, weights = of_moments
     cols = views.geometry.detector_shape[1]
-    alone = replace(views, cross_sections=np.ones((times.size, 1)))
-    motion, follow = None, SWEEPS_OF_TURN * sum(turns for _, turns in levels(cols))
-    for wide, turns in levels(cols):
-        binned = _binned(alone, wide)
+    one_material = replace(views, cross_sections=np.ones((times.size, 1)))
+    motion, remaining = None, SWEEPS_OF_TURN * sum(fits for _, fits in levels(cols))
+    for binning, fits in levels(cols):
+        binned = _binned(one_material, binning)
         grid = Grid.matching(binned.geometry)
         nz, ny, nx = grid.shape
         motion = (
             Motion.none((ny, nx, nz), times, _KNOTS, _CONTROLS) if motion is None else motion.on((ny, nx, nz), times)
         )
         fit, energies = EnergyFit(binned, grid, np.random.default_rng(0), motion, stop), _seen(binned, grid)
-        for _ in range(turns):
-            for residual in fit.sweeps(np.full(1, _HEAVIER * weights.max()), SWEEPS_OF_TURN):
-                follow -= 1
-                if not go_on(-follow, residual):
+        for _ in range(fits):
+            for residual in fit.sweeps(np.full(1, _WEIGHT_FACTOR * weights.max()), SWEEPS_OF_TURN):
+                remaining -= 1
+                if not go_on(-remaining, residual):
                     return None
             if stop():
                 return None
@@ -174,13 +176,13 @@ _LEVELS = ((64, 2), (160, 4), (320, 2))  # levels: largest number of columns, an
 _ROWS = 32  # number of binned rows examined
 _VIEWS = 60  # number of projections examined per energy
 # columns by which a magnification moves the outermost pixel; a smaller one is ignored, so that nothing is interpolated
-_MOVES = 0.1
-_HELPS = 0.995  # a registration must lower the deviation of held-out projections to this share
+_LEAST_MAGNIFICATION_PX = 0.1
+_LARGEST_DEVIATION_RATIO = 0.995  # a registration must lower the deviation of held-out projections to this share
 STEPS = sum(rounds for _, rounds in _LEVELS) + 1
 
 
 def register_energies(
-    views: EnergyViews, progress: Callable[[int, int], None] = lambda n, most: None
+    views: EnergyViews, progress: Callable[[int, int], None] = lambda n, total: None
 ) -> tuple[EnergyViews, tuple[Displacement, ...]]:
     """Align the scans at all energies: correct for the position of the sample and for the optics (parallel beam).
 
@@ -203,29 +205,33 @@ def register_energies(
     done = 0
     height = _ROWS * max(1, math.ceil(views.projections.shape[2] / _LEVELS[-1][0]))
     rows = busiest_rows(views.projections, height)
-    looked = views.select(_spread(views.energy), rows)
-    scaled = looked.projections * _strengths(looked)[looked.energy][:, None, None]
-    measured = np.ones(scaled.shape[1:], np.bool_) if looked.weight is None else (looked.weight > 0).mean(0) > 0.5
+    examined = views.select(_spread(views.energy), rows)
+    scaled = examined.projections * _strengths(examined)[examined.energy][:, None, None]
+    measured = np.ones(scaled.shape[1:], np.bool_) if examined.weight is None else (examined.weight > 0).mean(0) > 0.5
     for columns, rounds in _LEVELS:
         factor = max(1, math.ceil(scaled.shape[2] / columns))
         factor = min(factor, scaled.shape[1])
-        data, geometry = bin_views(scaled.astype(np.float32), factor), looked.geometry.binned(factor)
+        data, geometry = bin_views(scaled.astype(np.float32), factor), examined.geometry.binned(factor)
         known = bin_views(measured[None].astype(np.float32), factor)[0] > 0.5
         for _ in range(rounds):
-            moves = displacements(data, geometry, looked.energy, known, moves, 1, optics=True)
+            moves = displacements(data, geometry, examined.energy, known, moves, 1, optics=True)
             done += 1
             progress(done, STEPS)
         if factor == 1:
             break
     assert moves is not None
-    still = [Displacement()] * len(moves)
-    before, after = (judge(data, geometry, looked.energy, known, moves).overall for moves in (still, moves))
+    no_moves = [Displacement()] * len(moves)
+    deviation_without, deviation_with = (
+        judge(data, geometry, examined.energy, known, moves).overall for moves in (no_moves, moves)
+    )
     progress(STEPS, STEPS)
-    if not after < _HELPS * before:
-        return views, tuple(still)
-    least = 2 * _MOVES / views.projections.shape[2]
-    moves_kept = [move if abs(move.magnification - 1) > least else replace(move, magnification=1.0) for move in moves]
-    unmagnified = _unmagnified(views, moves_kept, (rows.start + looked.geometry.axis_row, views.geometry.axis_col))
+    if not deviation_with < _LARGEST_DEVIATION_RATIO * deviation_without:
+        return views, tuple(no_moves)
+    least_change = 2 * _LEAST_MAGNIFICATION_PX / views.projections.shape[2]
+    moves_kept = [
+        move if abs(move.magnification - 1) > least_change else replace(move, magnification=1.0) for move in moves
+    ]
+    unmagnified = _unmagnified(views, moves_kept, (rows.start + examined.geometry.axis_row, views.geometry.axis_col))
     return replace(unmagnified, geometry=displaced(views.geometry, views.energy, moves_kept)), tuple(moves_kept)
 
 
@@ -240,9 +246,9 @@ def _unmagnified(views: EnergyViews, moves: Sequence[Displacement], centre: tupl
     for energy, move in enumerate(moves):
         if move.magnification != 1:
             own = views.energy == energy
-            there = measured_unmagnified(weight[own] > 0, move.magnification, centre)
+            measured = measured_unmagnified(weight[own] > 0, move.magnification, centre)
             data[own] = unmagnified(data[own], move.magnification, centre)
-            weight[own] = there * unmagnified(weight[own], move.magnification, centre, order=1)
+            weight[own] = measured * unmagnified(weight[own], move.magnification, centre, order=1)
     return replace(views, projections=data, weight=weight)
 
 

@@ -144,10 +144,12 @@ def _measured(problem: ReconProblem) -> tuple[F32, F32 | None]:
     return data, weights
 
 
-def _because(still: float, moved: float, moves: bool) -> str:
+def _because(without_motion: float, with_motion: float, moves: bool) -> str:
     """Text on how held-out projections decided whether the sample moves, with advice if the residuals hardly differ."""
-    judged = f"the residual in held-out projections is {still:.4g} without motion and {moved:.4g} with motion"
-    if moves or moved >= still:
+    judged = (
+        f"the residual in held-out projections is {without_motion:.4g} without motion and {with_motion:.4g} with motion"
+    )
+    if moves or with_motion >= without_motion:
         return f"{'motion' if moves else 'no motion'}, because {judged}"
     return (
         "if the sample moved, make a second volume with --moves, and compare it with this volume. This volume has "

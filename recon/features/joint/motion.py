@@ -27,8 +27,8 @@ MIDDLE = 0.5  # time within the scan at which u is 0
 _STEPS = 8  # number of conjugate-gradient iterations
 # weight that penalises differences between neighbouring control points, divided by the typical curvature of a control
 # point
-_SMOOTH = 0.03
-_SMALL = 1e-3  # the same for the values of the control points
+_DIFFERENCE_WEIGHT = 0.03
+_VALUE_WEIGHT = 1e-3  # the same for the values of the control points
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +68,9 @@ class Motion:
         """The displacement u [3, y, x, z] at a time. `control` replaces the control points, if given."""
         y, x, z = (part.astype(np.float32) for part in self._space)
         part = np.tensordot(self._shares[time], self.control if control is None else control, 1).astype(np.float32)
-        wide = np.einsum("yp,dpqr->dyqr", y, part)
-        wide = np.einsum("xq,dyqr->dyxr", x, wide)
-        return np.ascontiguousarray(wide @ z.T)
+        displacement = np.einsum("yp,dpqr->dyqr", y, part)
+        displacement = np.einsum("xq,dyqr->dyxr", x, displacement)
+        return np.ascontiguousarray(displacement @ z.T)
 
     def back(self, time: int, field: F32) -> F64:
         """The transpose of `at`: from a field [3, y, x, z] to control points."""
@@ -87,12 +87,12 @@ def _spline(times: F64, knots: int) -> F64:
     """
     if knots == 1:
         return np.ones((times.size, 1))
-    even = np.linspace(0, 1, knots)
+    positions = np.linspace(0, 1, knots)
     if knots == 2:
         return np.stack([1 - times, times], 1)
     from scipy.interpolate import CubicSpline  # loading takes half a second
 
-    return np.asarray(CubicSpline(even, np.eye(knots), bc_type="natural")(times))
+    return np.asarray(CubicSpline(positions, np.eye(knots), bc_type="natural")(times))
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,14 +108,16 @@ class Seen:
 def descent(motion: Motion, energies: Sequence[Seen], image: Callable[[int], F32]) -> tuple[F64, list[F32]]:
     """The negative gradient of half the weighted squares with respect to the control points, and the derivatives of W x
     with respect to u."""
-    right, slope = np.zeros_like(motion.control), list[F32]()
+    negative_gradient, volume_slopes = np.zeros_like(motion.control), list[F32]()
     for part in energies:
         u, x = motion.at(part.time), image(part.time)
         residual = part.data - part.projector.forward_lines(moved(x, u))
-        slope.append(np.empty_like(u))
-        slopes(x, u, slope[-1])
-        right += motion.back(part.time, slope[-1] * part.projector.adjoint_lines(weighed(residual, part.weight)))
-    return right, slope
+        volume_slopes.append(np.empty_like(u))
+        slopes(x, u, volume_slopes[-1])
+        negative_gradient += motion.back(
+            part.time, volume_slopes[-1] * part.projector.adjoint_lines(weighed(residual, part.weight))
+        )
+    return negative_gradient, volume_slopes
 
 
 def improved(motion: Motion, energies: Sequence[Seen], image: Callable[[int], F32]) -> Motion:
@@ -124,24 +126,24 @@ def improved(motion: Motion, energies: Sequence[Seen], image: Callable[[int], F3
     Args:
         image: function that returns the volume [y, x, z] at a time, before it is displaced.
     """
-    right, slope = descent(motion, energies, image)
+    negative_gradient, volume_slopes = descent(motion, energies, image)
 
     def curved(control: F64) -> F64:
         out = np.zeros_like(control)
-        for part, own in zip(energies, slope, strict=True):
-            along = np.einsum("dyxz,dyxz->yxz", own, motion.at(part.time, control))
-            lines = weighed(part.projector.forward_lines(along), part.weight)
-            out += motion.back(part.time, own * part.projector.adjoint_lines(lines))
+        for part, volume_slope in zip(energies, volume_slopes, strict=True):
+            change = np.einsum("dyxz,dyxz->yxz", volume_slope, motion.at(part.time, control))
+            lines = weighed(part.projector.forward_lines(change), part.weight)
+            out += motion.back(part.time, volume_slope * part.projector.adjoint_lines(lines))
         return out
 
     start = np.random.default_rng(0).standard_normal(motion.control.shape)
     typical = float(np.vdot(start, curved(start)) / np.vdot(start, start))
 
     def normal(control: F64) -> F64:
-        return curved(control) + typical * _rough(control)
+        return curved(control) + typical * _roughness_gradient(control)
 
-    step = np.zeros_like(right)  # with few iterations, large motions are found first
-    conjugate_gradients(normal, right - typical * _rough(motion.control), step, _STEPS)
+    step = np.zeros_like(negative_gradient)  # with few iterations, large motions are found first
+    conjugate_gradients(normal, negative_gradient - typical * _roughness_gradient(motion.control), step, _STEPS)
     return Motion(motion.shape, motion.times, motion.control + step)
 
 
@@ -150,14 +152,14 @@ def weighed(lines: F32, weight: F32 | None) -> F32:
     return lines if weight is None else weight * lines
 
 
-def _rough(control: F64) -> F64:
+def _roughness_gradient(control: F64) -> F64:
     """Gradient of half the weighted squares of two quantities: differences between neighbours in space, and the values
     themselves."""
-    out = _SMALL * control
+    out = _VALUE_WEIGHT * control
     for axis in (2, 3, 4):
-        wide = [(0, 0)] * 5
-        wide[axis] = (1, 1)
-        out -= _SMOOTH * np.diff(np.pad(np.diff(control, axis=axis), wide), axis=axis)
+        padding = [(0, 0)] * 5
+        padding[axis] = (1, 1)
+        out -= _DIFFERENCE_WEIGHT * np.diff(np.pad(np.diff(control, axis=axis), padding), axis=axis)
     return out
 
 
@@ -171,16 +173,16 @@ def conjugate_gradients(
         go_on: called before each iteration; False ends it.
     """
     of_kind = solution.dtype.type
-    towards, squares = residual.copy(), float(np.vdot(residual, residual))
+    direction, squares = residual.copy(), float(np.vdot(residual, residual))
     for _ in range(steps):
         if squares == 0 or not go_on():
             break
-        image = normal(towards)
-        length = of_kind(squares / float(np.vdot(towards, image)))
-        solution += length * towards
+        image = normal(direction)
+        length = of_kind(squares / float(np.vdot(direction, image)))
+        solution += length * direction
         residual -= length * image
-        before, squares = squares, float(np.vdot(residual, residual))
-        towards = residual + of_kind(squares / before) * towards
+        last_squares, squares = squares, float(np.vdot(residual, residual))
+        direction = residual + of_kind(squares / last_squares) * direction
 
 
 def moved(x: F32, u: F32 | None) -> F32:

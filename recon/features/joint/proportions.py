@@ -29,8 +29,8 @@ from recon.features.joint.spectral import Materials
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
 # first λ, divided by the mean curvature of the projections; ratio of the next λ to it; number of tests
-_HEAVIEST, _LIGHTER, _TRIALS = 32.0, 3.0, 9
-_IN_TIME = 0.03  # the constant τ
+_LARGEST_SMOOTHNESS, _SMOOTHNESS_STEP, _TRIALS = 32.0, 3.0, 9
+_TIME_WEIGHT = 0.03  # the constant τ
 SOLUTION_STEPS, _TRIAL_STEPS = 60, 20  # number of conjugate-gradient iterations of the solution, and of a test
 TRIAL_STEPS = _TRIALS * _TRIAL_STEPS
 """Largest number of iterations of all tests together."""
@@ -122,16 +122,16 @@ class Proportions:
     def rough(self, factors: F32) -> F32:
         """Gradient of half the weighted squares of differences, without λ."""
         out = np.zeros_like(factors)
-        flow = np.float32(_IN_TIME) * self.matter**2 * np.diff(factors, axis=0)
-        out[:-1] -= flow
-        out[1:] += flow
+        differences = np.float32(_TIME_WEIGHT) * self.matter**2 * np.diff(factors, axis=0)
+        out[:-1] -= differences
+        out[1:] += differences
         for axis in range(3):
             low, high = ((slice(None),) * axis + (part,) for part in (slice(None, -1), slice(1, None)))
             pairs = self.matter[low] * self.matter[high]
-            for own, into in zip(factors, out, strict=True):
-                across = pairs * (own[high] - own[low])
-                into[low] -= across
-                into[high] += across
+            for factor, target in zip(factors, out, strict=True):
+                differences_in_space = pairs * (factor[high] - factor[low])
+                target[low] -= differences_in_space
+                target[high] += differences_in_space
         return out
 
     def ones(self) -> F32:
@@ -168,25 +168,25 @@ def smoothness(fit: Proportions, judge: Proportions, first: F32, go_on: Callable
     Args:
         first: factors to start with.
     """
-    factors, tried, worse = first, list[tuple[float, F64]](), 0
+    factors, trials, worse = first, list[tuple[float, F64]](), 0
     best = np.full(judge.data.shape[0], np.inf)
     with suppress(StoppedError):
         for trial in range(_TRIALS):
-            smooth = _HEAVIEST / _LIGHTER**trial
+            smooth = _LARGEST_SMOOTHNESS / _SMOOTHNESS_STEP**trial
             factors = fit.solved(smooth, factors, go_on, _TRIAL_STEPS)
-            tried.append((smooth, judge.left(factors)))
-            best, worse = (tried[-1][1], 0) if tried[-1][1].sum() < best.sum() else (best, worse + 1)
+            trials.append((smooth, judge.left(factors)))
+            best, worse = (trials[-1][1], 0) if trials[-1][1].sum() < best.sum() else (best, worse + 1)
             if worse == 2:
                 break
-    for smooth, residuals in tried:
-        apart = residuals - best
-        if apart.sum() <= math.sqrt(apart.size) * apart.std(ddof=min(1, apart.size - 1)):
+    for smooth, residuals in trials:
+        excess = residuals - best
+        if excess.sum() <= math.sqrt(excess.size) * excess.std(ddof=min(1, excess.size - 1)):
             return smooth, float(residuals.sum())
-    return _HEAVIEST, math.inf
+    return _LARGEST_SMOOTHNESS, math.inf
 
 
 # number of rows of a test reconstruction; line integral above which all rays have equal weight
-_ROWS, _DEEPEST = 16, 7.0
+_ROWS, _DEEPEST_LINE_INTEGRAL = 16, 7.0
 STEPS = TRIAL_STEPS + SOLUTION_STEPS
 
 
@@ -240,7 +240,7 @@ def share_problem(views: EnergyViews, densities: F32, states: tuple[int, int], g
         lines = projector.forward_lines(volume_lines(density))
         depth += of_view[:, material] * lines
         data = data - of_view[:, states[0] if material in states else material] * lines
-    weight = np.exp(-np.minimum(depth, _DEEPEST))
+    weight = np.exp(-np.minimum(depth, _DEEPEST_LINE_INTEGRAL))
     if views.weight is not None:
         weight[projection_lines(views.weight) == 0] = 0
     difference = sections[:, [states[1]]] - sections[:, [states[0]]]

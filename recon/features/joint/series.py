@@ -35,9 +35,9 @@ from recon.voxels.projector import Projector, projection_lines, volume_lines, vo
 
 MOMENTS = 64  # largest number of moments between two knots; the projections of one moment are treated as simultaneous
 _MOTION_MOMENTS = 16  # number of moments into which the scan is divided to estimate the motion, which is smooth in time
-_SURE = 2.0  # standard errors over eight held-out blocks, see `exceeds_standard_error`; 4 % false alarms
+_STANDARD_ERRORS = 2.0  # standard errors over eight held-out blocks, see `exceeds_standard_error`; 4 % false alarms
 # motion or factors are accepted if they lower the squared residual in held-out projections at least to this share
-_LESS = 0.95
+_LARGEST_SQUARES_RATIO = 0.95
 _ROWS = 16  # number of rows in the test of factors
 _TRIALS = 24 * 13  # number of iterations that choose the weights on these rows; 24 * 11 for usual data, 24 * 16 at most
 _TURN = 4  # time of the steps of a motion, in units of iterations, in addition to the iterations for the motion
@@ -110,19 +110,19 @@ class TimedVolumes:
 
     def at(self, time: float) -> F32:
         """The volume [z, y, x] at a time. Before the first knot and after the last knot, the volume does not change."""
-        before = np.tensordot(hats(time, self.times)[0].astype(np.float32), self.volumes, 1)
+        at_rest = np.tensordot(hats(time, self.times)[0].astype(np.float32), self.volumes, 1)
         if self.motion is None:
-            return before
+            return at_rest
         past = np.clip((time - self.times[0]) / np.ptp(self.times), 0, 1)
-        now = self.motion.on(self.motion.shape, np.array([past]))
-        return volume_slices(moved(volume_lines(before), now.at(0)))
+        motion_now = self.motion.on(self.motion.shape, np.array([past]))
+        return volume_slices(moved(volume_lines(at_rest), motion_now.at(0)))
 
 
 def hats(times: ArrayLike, knots: F64) -> F64:
     """Weights [time, knot] for linear interpolation between evenly spaced knots. Beyond the first and the last knot,
     the weights are constant."""
-    place = np.interp(np.atleast_1d(times), knots, np.arange(knots.size))
-    return np.maximum(0, 1 - np.abs(place[:, None] - np.arange(knots.size)))
+    knot_position = np.interp(np.atleast_1d(times), knots, np.arange(knots.size))
+    return np.maximum(0, 1 - np.abs(knot_position[:, None] - np.arange(knots.size)))
 
 
 def fit_series(
@@ -176,24 +176,24 @@ def fit_series(
         weights = weights_by_views(energies, grid, seed, go_on, stop, alike=True)
     else:
         weights = np.full(knots, tv_weight / math.sqrt(past.size))
-    few, few_past = of_moments(views, times, _MOTION_MOMENTS)
-    coarse = OfMoments(few, few_past, weights * math.sqrt(past.size / few_past.size))
+    coarse_views, coarse_past = of_moments(views, times, _MOTION_MOMENTS)
+    coarse = OfMoments(coarse_views, coarse_past, weights * math.sqrt(past.size / coarse_past.size))
     learnt, unseen = _motion(coarse, OfMoments(energies, past, weights), motion, go_on, stop)
     smooth = None if learnt is not None else smooth_factors(energies, grid, weights, sweeps, seed, go_on, stop)
     fit = EnergyFit(energies, grid, np.random.default_rng(seed), learnt, stop)
-    heard = GoesOn(go_on)
-    volumes, residual = fitted(fit, weights, sweeps, heard)
+    watched = GoesOn(go_on)
+    volumes, residual = fitted(fit, weights, sweeps, watched)
     timed = TimedVolumes(times, volumes, grid, residual, learnt, unseen)
-    return timed if smooth is None or not heard.going or stop() else _as_factors(timed, fit, smooth, go_on)
+    return timed if smooth is None or not watched.going or stop() else _as_factors(timed, fit, smooth, go_on)
 
 
 def _refuse_gaps(times: F64, knots: F64) -> None:
     """Raise ValueError if too few projections are near one of the volumes."""
-    near = (hats(times, knots) > 0.5).sum(0)
-    if near.min() < _LEAST_NEAR:
-        k = int(near.argmin())
+    n_near = (hats(times, knots) > 0.5).sum(0)
+    if n_near.min() < _LEAST_NEAR:
+        k = int(n_near.argmin())
         raise ValueError(
-            f"too few projections near volume {k + 1} of {knots.size} (at time {knots[k]:g}): {near[k]} projections "
+            f"too few projections near volume {k + 1} of {knots.size} (at time {knots[k]:g}): {n_near[k]} projections "
             f"are closer to this time than {np.diff(knots)[0] / 2:g}, but at least {_LEAST_NEAR} are needed. Ask "
             "for fewer volumes, or reconstruct the projections before and after a gap separately"
         )
@@ -216,10 +216,12 @@ def _motion(
     return learnt and learnt.on(learnt.shape, fine.times), unseen
 
 
-def _moves(still: F64, moved: F64) -> bool:
+def _moves(squares_without: F64, squares_with: F64) -> bool:
     """Whether the sample moves, decided with the squared residuals [block] of held-out projections without and with
     motion."""
-    return exceeds_standard_error(still - moved, _SURE) and float(moved.mean()) < _LESS * float(still.mean())
+    return exceeds_standard_error(squares_without - squares_with, _STANDARD_ERRORS) and float(
+        squares_with.mean()
+    ) < _LARGEST_SQUARES_RATIO * float(squares_without.mean())
 
 
 def _as_factors(
@@ -228,7 +230,7 @@ def _as_factors(
     """The volumes, replaced by their mean times smooth factors. If the steps are stopped, the volumes stay
     unchanged."""
     stop, problem = fit.stop, _of_factors(fit.views, timed.volumes, timed.grid, fit.stop)
-    steps = Countdown(lambda after: go_on(-after, timed.residual), SOLUTION_STEPS)
+    steps = Countdown(lambda remaining: go_on(-remaining, timed.residual), SOLUTION_STEPS)
     factors = problem.solved(smooth, problem.ones(), steps)
     if not steps.going or stop():
         return timed
@@ -264,21 +266,23 @@ def smooth_factors(
     rows, grid = trial_rows(views, grid, _ROWS)
     held_out = views.parted(ONE_IN) == ONE_IN // 2
     fit = EnergyFit(views.select(np.flatnonzero(~held_out), rows), grid, np.random.default_rng(seed), stop=stop)
-    heard = GoesOn(lambda sweep, residual: go_on(sweep - sweeps - TRIAL_STEPS, residual))
-    free, residual = fitted(fit, weights, sweeps, heard)
-    if not heard.going or stop():
+    watched = GoesOn(lambda sweep, residual: go_on(sweep - sweeps - TRIAL_STEPS, residual))
+    separate_volumes, residual = fitted(fit, weights, sweeps, watched)
+    if not watched.going or stop():
         return None
-    problem = _of_factors(views.select(np.arange(held_out.size), rows), free, grid, stop)
+    problem = _of_factors(views.select(np.arange(held_out.size), rows), separate_volumes, grid, stop)
     to_fit, judge = problem.select(np.flatnonzero(~held_out)), problem.select(np.flatnonzero(held_out))
-    steps = Countdown(lambda after: go_on(-after, residual), TRIAL_STEPS)
+    steps = Countdown(lambda remaining: go_on(-remaining, residual), TRIAL_STEPS)
     smooth, judged_squares = smoothness(to_fit, judge, to_fit.ones(), steps)
     steps.end()
     if not steps.going or stop():
         return None
-    alone = (
-        replace(judge, matter=np.ones_like(judge.matter)).left(np.stack([volume_lines(image) for image in free])).sum()
+    squares_of_separate = (
+        replace(judge, matter=np.ones_like(judge.matter))
+        .left(np.stack([volume_lines(image) for image in separate_volumes]))
+        .sum()
     )
-    return smooth if judged_squares < _LESS * alone else None
+    return smooth if judged_squares < _LARGEST_SQUARES_RATIO * squares_of_separate else None
 
 
 def refuse_few(knots: int, n: int) -> None:
@@ -290,11 +294,11 @@ def refuse_few(knots: int, n: int) -> None:
         )
 
 
-def of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F64]:
-    """The projections, divided into at most `most` moments of equal size, and the times of these moments within the
-    scan, 0 to 1."""
+def of_moments(views: TimedViews, times: F64, most_moments: int) -> tuple[EnergyViews, F64]:
+    """The projections, divided into at most `most_moments` moments of equal size, and the times of these moments within
+    the scan, 0 to 1."""
     n = views.geometry.n_views
-    moments = min(most, n)
+    moments = min(most_moments, n)
     moment = np.empty(n, np.intp)
     moment[np.argsort(views.times, kind="stable")] = np.arange(n) * moments // n
     middles = np.bincount(moment, views.times) / np.bincount(moment)

@@ -23,15 +23,15 @@ from recon.features.joint.energy_fit import EnergyFit, EnergyViews, fitted, tria
 # number of rows and of iterations of a test of weights, which starts with the volumes of the previous test
 TRIAL_ROWS, _TRIAL_SWEEPS = 16, 8
 # share of the open-beam intensity below which rays have lower weights; smallest weight of a ray
-_LITTLE, _LEAST = 0.1, 0.1
-_AVERAGED = 1.5  # number of pixels over which line integrals are averaged
-_FIRST = 0.1  # the first weight, divided by the largest gradient at zero
+_LOW_TRANSMISSION, _LEAST_WEIGHT = 0.1, 0.1
+_AVERAGED_PIXELS = 1.5  # number of pixels over which line integrals are averaged
+_FIRST_WEIGHT = 0.1  # the first weight, divided by the largest gradient at zero
 ALIKE_LONGER = 3  # factor on the iterations, because volumes at different times differ more than materials
 _TRIALS = 12  # tests of one weight for all components, each half of the previous one
-_HEAVIER = 4  # tests of a larger weight for all except the first component, each twice the previous one
-_AS_WELL = 1.01  # weights whose residual is within this factor of the smallest count as equally good
+_HEAVIER_TESTS = 4  # tests of a larger weight for all except the first component, each twice the previous one
+_EQUAL_RESIDUAL_RATIO = 1.01  # weights whose residual is within this factor of the smallest count as equally good
 MATERIAL_SWEEPS = 20
-TRIAL_SWEEPS = (_TRIALS + _HEAVIER) * _TRIAL_SWEEPS  # largest number of iterations of all tests
+TRIAL_SWEEPS = (_TRIALS + _HEAVIER_TESTS) * _TRIAL_SWEEPS  # largest number of iterations of all tests
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ def fit_materials(
 
 def weight_of(transmission: F32) -> F32:
     """Weights, up to 1, of rays with this transmission."""
-    return np.clip(transmission / _LITTLE, _LEAST, 1)
+    return np.clip(transmission / _LOW_TRANSMISSION, _LEAST_WEIGHT, 1)
 
 
 def _weighed(views: EnergyViews) -> EnergyViews:
@@ -120,14 +120,16 @@ def _weighed(views: EnergyViews) -> EnergyViews:
     mean line integral around the ray. Given weights above a tenth of the largest weight count as equal, because a wider
     range of weights would need more iterations.
     """
-    there = np.ones_like(views.projections) if views.weight is None else (views.weight > 0).astype(np.float32)
-    transmission = np.empty_like(there)
+    known = np.ones_like(views.projections) if views.weight is None else (views.weight > 0).astype(np.float32)
+    transmission = np.empty_like(known)
     for view, image in enumerate(views.projections):
-        near = gaussian_filter(there[view], _AVERAGED)
-        transmission[view] = np.exp(-gaussian_filter(there[view] * image, _AVERAGED) / np.maximum(near, 1e-3))
+        known_nearby = gaussian_filter(known[view], _AVERAGED_PIXELS)
+        transmission[view] = np.exp(
+            -gaussian_filter(known[view] * image, _AVERAGED_PIXELS) / np.maximum(known_nearby, 1e-3)
+        )
     weight = weight_of(transmission)
     if views.weight is not None:
-        weight *= np.minimum(1, views.weight / (_LITTLE * (float(views.weight.max()) or 1)))
+        weight *= np.minimum(1, views.weight / (_LOW_TRANSMISSION * (float(views.weight.max()) or 1)))
     return replace(views, weight=weight.astype(np.float32))
 
 
@@ -151,12 +153,12 @@ class _Trials:
         self._fit, self._judge, self._sweeps = fit, judge, sweeps
         self._go_on, self._stop = go_on, stop
 
-    def residual(self, weights: F64, after: int) -> float:
-        """Residual in held-out projections; infinite if the test was stopped. `after` is the number of tests that may
-        still follow."""
+    def residual(self, weights: F64, tests_after: int) -> float:
+        """Residual in held-out projections; infinite if the test was stopped. `tests_after` is the number of tests that
+        may still follow."""
         n = self._sweeps
         for sweep, residual in enumerate(self._fit.sweeps(weights, n), 1):
-            if not self._go_on(sweep - n * (1 + after), residual):
+            if not self._go_on(sweep - n * (1 + tests_after), residual):
                 self.going = False
                 return math.inf
         if self._stop():
@@ -165,30 +167,30 @@ class _Trials:
         # not z, because the share of an energy in these projections is different
         return self._judge.residual_of(self._fit.densities())
 
-    def common(self, after: int) -> F64:
+    def common(self, tests_after: int) -> F64:
         """The best single weight for all components: the weight is halved until the prediction has been worse twice. If
         the tests are stopped, the best weight so far."""
-        weights = np.full(len(self._fit.z), _FIRST * self._fit.steepest())
-        best, least, worse = weights, math.inf, 0
+        weights = np.full(len(self._fit.z), _FIRST_WEIGHT * self._fit.steepest())
+        best, least, n_worse = weights, math.inf, 0
         for trial in range(1, 1 + _TRIALS):
-            now = self.residual(weights, _TRIALS - trial + after)
+            residual = self.residual(weights, _TRIALS - trial + tests_after)
             if not self.going:
                 return best
-            best, least, worse = (weights, now, 0) if now < least else (best, least, worse + 1)
-            if worse == 2:
+            best, least, n_worse = (weights, residual, 0) if residual < least else (best, least, n_worse + 1)
+            if n_worse == 2:
                 break
             weights = weights / 2
         return best
 
-    def heaviest(self, weights: F64, factor: F64, rungs: int, after: int) -> F64:
+    def heaviest(self, weights: F64, factor: F64, rungs: int, tests_after: int) -> F64:
         """The largest weights, in powers of `factor`, that predict as well as the best weights. If the tests are
         stopped, `weights`."""
         ladder = [weights * factor**octave for octave in range(rungs)]
-        residuals = [self.residual(rung, after + rungs - 1 - n) for n, rung in enumerate(ladder) if self.going]
+        residuals = [self.residual(rung, tests_after + rungs - 1 - n) for n, rung in enumerate(ladder) if self.going]
         if not self.going:
             return weights
-        limit = _AS_WELL * min(residuals)
-        return next(weight for weight, now in zip(ladder[::-1], residuals[::-1], strict=True) if now <= limit)
+        limit = _EQUAL_RESIDUAL_RATIO * min(residuals)
+        return next(weight for weight, residual in zip(ladder[::-1], residuals[::-1], strict=True) if residual <= limit)
 
 
 def weights_by_views(
@@ -216,9 +218,9 @@ def weights_by_views(
         for chosen in (~held_out, held_out)
     )
     trials = _Trials(fit, judge, (ALIKE_LONGER if alike else 1) * _TRIAL_SWEEPS, go_on, stop)
-    weights = trials.common(after=_HEAVIER)
+    weights = trials.common(tests_after=_HEAVIER_TESTS)
     components = np.arange(len(weights))
     if trials.going:
         factor = np.where((components > 0) | alike, 2.0, 1.0)
-        weights = trials.heaviest(weights, factor, _HEAVIER, after=0)
+        weights = trials.heaviest(weights, factor, _HEAVIER_TESTS, tests_after=0)
     return weights

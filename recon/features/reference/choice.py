@@ -35,8 +35,9 @@ from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem, times_power
 
 MARGIN = 16  # voxels beyond the box in which the reference is also kept, because the sample may have moved
-_FIRST = 1.4  # first weight of the total variation of the change, divided by the best weight of total variation
-_FEW = 6  # iterations with a displaced copy
+# first weight of the total variation of the change, divided by the best weight of total variation
+_FIRST_CHANGE_WEIGHT = 1.4
+_DISPLACED_SWEEPS = 6  # iterations with a displaced copy
 
 
 class ReferenceVerdict(NamedTuple):
@@ -73,9 +74,9 @@ def not_moved(reference: Volume, problem: VoxelProblem) -> Moved | None:
     if particles is None:
         return None
     nz, ny, nx = grid.shape
-    still = np.zeros((3, ny, nx, nz), np.float32)
+    no_displacement = np.zeros((3, ny, nx, nz), np.float32)
     radius = problem.projector.geometry.reach / problem.projector.grid.voxel_size if problem.wide else np.inf
-    return Moved(particles, first, still, np.ones(particles.count + 1), radius)
+    return Moved(particles, first, no_displacement, np.ones(particles.count + 1), radius)
 
 
 def width_of(problem: VoxelProblem) -> float:
@@ -141,46 +142,46 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     smooth = trial.volume_of_weight(mu) if trial.smooth is None else trial.smooth
     width, grid = width_of(trial.scan), problem.projector.grid
     affine = Basis.affine(grid, width)
-    c = roughly_moved(moved, smooth, grid, width)
-    moved = replace(moved, u=padded(affine.field(c)))
-    beside = np.where(moved.known(), 0, smooth).astype(np.float32)
-    moved = affinely_moved(MotionViews.of(problem), moved, affine, beside)
+    rough_motion = roughly_moved(moved, smooth, grid, width)
+    moved = replace(moved, u=padded(affine.field(rough_motion)))
+    additional = np.where(moved.known(), 0, smooth).astype(np.float32)
+    moved = affinely_moved(MotionViews.of(problem), moved, affine, additional)
     coefficients, gains = affine.nearest(moved.u) * affine.used, moved.gains[:2].tolist()
-    about = about_reference(coefficients, reference, problem, width)
+    about_axis = about_reference(coefficients, reference, problem, width)
     start = np.where(moved.known(), moved.volume(), smooth).astype(np.float32)
-    fit = StateFit(problem, moved, start, _FIRST * mu, width)
+    fit = StateFit(problem, moved, start, _FIRST_CHANGE_WEIGHT * mu, width)
     fit.rounds(PLAN)
     if trial.ended or not fit.x.any():
         return ReferenceVerdict(False, "stopped before it was tried")
-    best, alone = _best_weight(trial, fit), _without(trial, fit, smooth, mu)
-    if best is None or alone is None:
+    best, without_reference = _best_weight(trial, fit), _without(trial, fit, smooth, mu)
+    if best is None or without_reference is None:
         return ReferenceVerdict(False, "stopped before it was tried")
-    least = choice.least
-    others = [("the same total variation without the reference", trial.in_line_integrals(alone.residuals))]
+    least = choice.best_residuals
+    others = [("the same total variation without the reference", trial.in_line_integrals(without_reference.residuals))]
     others += [] if least is None or choice.best is None else [(choice.predictions[choice.best].name, least)]
-    own = trial.in_line_integrals(best.residuals)
-    told = f"{MEASURE}: with the reference {own.mean():#.4g}"
+    residuals_with = trial.in_line_integrals(best.residuals)
+    residuals_text = f"{MEASURE}: with the reference {residuals_with.mean():#.4g}"
     for name, residuals in others:
-        told += f"; with {name} {residuals.mean():#.4g}"
-        if not significantly_better(own, residuals, LEAST_GAIN):
+        residuals_text += f"; with {name} {residuals.mean():#.4g}"
+        if not significantly_better(residuals_with, residuals, LEAST_GAIN):
             return ReferenceVerdict(
-                False, f"the reference does not predict held-out projections better than {name} ({told})"
+                False, f"the reference does not predict held-out projections better than {name} ({residuals_text})"
             )
-    if (where := _better_displaced(trial, fit)) is not None:
+    if (direction := _better_displaced(trial, fit)) is not None:
         return ReferenceVerdict(
             False,
             (
-                f"a copy of the reference that is displaced by a voxel {where} predicts held-out projections "
+                f"a copy of the reference that is displaced by a voxel {direction} predicts held-out projections "
                 "equally well or better"
             ),
         )
-    all_views = best.strength * np.sqrt(ONE_IN / (ONE_IN - 1))
-    of_scan = problem.units.prior(Prior(float(all_views)), problem.weight is not None, 1).weight
+    weight_of_all_views = best.strength * np.sqrt(ONE_IN / (ONE_IN - 1))
+    of_scan = problem.units.prior(Prior(float(weight_of_all_views)), problem.weight is not None, 1).weight
     splines = Basis.splines(grid, width, KNOTS)
     bent = splines.nearest(fit.moved.u - padded(affine.field(coefficients)))
     edge = problem.units.projector(problem.projector, 1).grid.voxel_size
-    mm = [(edge * each).ravel().tolist() for each in (about, bent.mean(-1, keepdims=True))]
-    return ReferenceVerdict(True, told, of_scan, mm[0], mm[1], gains)
+    motion_mm = [(edge * motion_px).ravel().tolist() for motion_px in (about_axis, bent.mean(-1, keepdims=True))]
+    return ReferenceVerdict(True, residuals_text, of_scan, motion_mm[0], motion_mm[1], gains)
 
 
 def _best_weight(trial: Trial, fit: StateFit) -> BestStrength | None:
@@ -216,12 +217,12 @@ def _better_displaced(trial: Trial, fit: StateFit) -> str | None:
         u = fit.moved.u.copy()
         u[axis] += step
         copy = fit.again(fit.weight, fit.x, replace(fit.moved, u=u))
-        copy.solve(most=_FEW)
+        copy.solve(iterations=_DISPLACED_SWEEPS)
         return trial.residuals(copy.x)
 
-    own = trial.residuals(fit.x)
+    undisplaced = trial.residuals(fit.x)
     for axis in range(2 if fit.moved.u[2].any() == 0 else 3):
         for step in (-1, 1):
-            if not exceeds_standard_error(displaced(axis, step) - own, 1.0):
+            if not exceeds_standard_error(displaced(axis, step) - undisplaced, 1.0):
                 return f"along {'yxz'[axis]}"
     return None

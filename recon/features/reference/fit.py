@@ -31,12 +31,13 @@ from recon.voxels.voxel_problem import VoxelProblem, difference_weights
 OWN = 0.3
 """Weight of the total variation of the volume, divided by the weight of the total variation of the change."""
 _STEPS = 6  # dual steps of each proximal step; with three dual steps, damped steps do not converge
-_EDGE = 0.12  # slope of the moved reference, in particle levels per voxel, above which a voxel belongs to an edge
+_EDGE_SLOPE = 0.12  # slope of the moved reference, in particle levels per voxel, above which a voxel belongs to an edge
 PLAN: tuple[tuple[tuple[int, float], ...], ...] = (((4, 1), (4, 1)), ((6, 0.5), (6, 0)), ((KNOTS, 0), (KNOTS, 0)))
 """The rounds. Each round lists the steps of the motion, with the number of intervals of the splines and the blur in
 voxels.
 """
-_MOST, _STILL = 12, 2e-3  # iterations of a volume within the rounds, and relative change below which it has converged
+# iterations of a volume within the rounds, and relative change below which it has converged
+_MOST_ITERATIONS, _CONVERGED_CHANGE = 12, 2e-3
 
 
 class TwoVariations:
@@ -50,7 +51,7 @@ class TwoVariations:
     ) -> None:
         self._weights, self._nonnegative, self._steps = weights, nonnegative, steps
         self._fields = np.zeros((3, *shape), np.float32), np.zeros((3, *shape), np.float32)
-        self._start, self._beside = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        self._start, self._to_reference = np.empty(shape, np.float32), np.empty(shape, np.float32)
         self.m = self.own = self.change = self._start
 
     def copy(self) -> TwoVariations:
@@ -69,13 +70,14 @@ class TwoVariations:
             np.maximum(x, 0, out=x, where=self._nonnegative)
             return
         self._start[...] = x
-        given = self._start, self._fields, self.m, threshold, self._weights, self._nonnegative, (x, self._beside)
-        pace = pace_of(threshold, self._weights)
-        primal(*given)
+        results = x, self._to_reference
+        arguments = self._start, self._fields, self.m, threshold, self._weights, self._nonnegative, results
+        step_length = pace_of(threshold, self._weights)
+        primal(*arguments)
         for _ in range(self._steps):
-            ascend(x, self.own, pace, self._weights, self._fields[0])
-            ascend(self._beside, self.change, pace, self._weights, self._fields[1])
-            primal(*given)
+            ascend(x, self.own, step_length, self._weights, self._fields[0])
+            ascend(self._to_reference, self.change, step_length, self._weights, self._fields[1])
+            primal(*arguments)
 
     def turn(self) -> None:
         """Does nothing: the differences are always those to the next voxels."""
@@ -115,30 +117,30 @@ class StateFit:
         """A copy of the fit with another weight and volume, and with another position of the reference if `moved` is
         given.
         """
-        other = copy(self)
-        other.weight, other.x, other.moved = weight, x.copy(), moved or self.moved
-        other._prox = self._prox.copy()
-        other.m, other.known = (self.m, self.known) if moved is None else (moved.volume(), moved.known())
-        return other
+        copied = copy(self)
+        copied.weight, copied.x, copied.moved = weight, x.copy(), moved or self.moved
+        copied._prox = self._prox.copy()
+        copied.m, copied.known = (self.m, self.known) if moved is None else (moved.volume(), moved.known())
+        return copied
 
     def alone(self) -> None:
         """Leave out the reference. Both weights then apply to the total variation of x."""
         self.m, self.known = np.zeros_like(self.m), np.ones_like(self.known)
 
-    def solve(self, own: F32 | float = 1.0, change: F32 | float = 1.0, most: int = _MOST) -> None:
+    def solve(self, own: F32 | float = 1.0, change: F32 | float = 1.0, iterations: int = _MOST_ITERATIONS) -> None:
         """Improve x. `own` and `change` are factors [y, x, z] on the two weights."""
         if not self.going.going:
             return
         self._prox.about(self.m, *self._weights(own, change))
-        done = self._done
+        done_before = self._done
 
         def go_on(sweep: int, residual: float) -> bool:
-            self._done = done + sweep
+            self._done = done_before + sweep
             return self.going(self._done, residual)
 
         self.x = ordered_fista(
-            replace(self.problem, go_on=GoesOn(go_on)), self.x, TvWeight(self.weight), self._subsets, sweeps=most,
-            prox=self._prox, still=_STILL,
+            replace(self.problem, go_on=GoesOn(go_on)), self.x, TvWeight(self.weight), self._subsets, sweeps=iterations,
+            prox=self._prox, still=_CONVERGED_CHANGE,
         )  # fmt: skip
 
     def _weights(self, own: F32 | float, change: F32 | float) -> tuple[F32, F32]:
@@ -159,34 +161,34 @@ class StateFit:
         m, slopes = self.moved.with_slopes(self.moved.at_rest)
         assert slopes is not None
         known = self.moved.known()
-        steep = np.sqrt(np.square(slopes).sum(0)) > _EDGE * self.moved.particles.level
-        edge = ndi.maximum_filter(steep & known, (3, 3, 1))
-        beside = np.where(edge, 0, self.x - m * known).astype(np.float32)
+        is_steep = np.sqrt(np.square(slopes).sum(0)) > _EDGE_SLOPE * self.moved.particles.level
+        edge = ndi.maximum_filter(is_steep & known, (3, 3, 1))
+        additional = np.where(edge, 0, self.x - m * known).astype(np.float32)
         for intervals, blur in steps:
             basis = Basis.splines(self.problem.projector.grid, self.width, intervals)
-            self.moved = improved(self._views, self.moved, basis, blur, beside, False)
+            self.moved = improved(self._views, self.moved, basis, blur, additional, False)
         self.m, self.known = self.moved.volume(), self.moved.known()
 
-    def rounds(self, plan: Sequence[Sequence[tuple[int, float]]], most: int = _MOST) -> None:
-        """Improve the volume and the motion of the reference alternately, with at most `most` iterations in each
+    def rounds(self, plan: Sequence[Sequence[tuple[int, float]]], iterations: int = _MOST_ITERATIONS) -> None:
+        """Improve the volume and the motion of the reference alternately, with at most `iterations` iterations in each
         round.
         """
-        self.solve(most=most)
+        self.solve(iterations=iterations)
         for steps in plan:
             if not self.going.going:
                 return
             self.follow(steps)
-            self.solve(most=most)
+            self.solve(iterations=iterations)
 
-    def sharpen(self, rounds: int, most: int = _MOST, lines_from: float = ALL_LINES) -> None:
+    def sharpen(self, rounds: int, iterations: int = _MOST_ITERATIONS, lines_from: float = ALL_LINES) -> None:
         """Improve the volume in rounds in which the weights are lower where the change is steep, and along dark lines
         in particles. `lines_from` is explained in `falling`.
         """
         for _ in range(rounds):
             own, change = falling(self.problem, self.moved, self.x, self.m, lines_from)
-            self.solve(own, change, most)
+            self.solve(own, change, iterations)
 
-    def on_half_voxels(self, most: int = _MOST) -> int:
+    def on_half_voxels(self, iterations: int = _MOST_ITERATIONS) -> int:
         """Improve the volume once more as `sharpen` does, but on half voxels, see `recon.voxels.half_voxels`.
 
         The moved reference and the weights are the same in the four half voxels of a voxel. This ends the fit: the
@@ -206,7 +208,9 @@ class StateFit:
             prox.about(m, repeated(own), repeated(change))
             return prox
 
-        self.x = on_half_voxels(self.problem, self.x, self.weight, prox_of, done=self._done, sweeps=most, still=_STILL)
+        self.x = on_half_voxels(
+            self.problem, self.x, self.weight, prox_of, done=self._done, sweeps=iterations, still=_CONVERGED_CHANGE
+        )
         ended = self.problem.decide.ended
         return 0 if ended is None else ended.after
 
@@ -218,18 +222,18 @@ def gains_of(x: F32, moved: Moved) -> NDArray[np.float64]:
     A particle that has disappeared gets 0.
     """
     own, label, gains = moved.particles, moved.labels(), moved.gains.copy()
-    ground, above, known = moved.pulled(own.ground), moved.pulled(own.above), moved.known()
-    apart = known & (above < 0.1 * own.level) & (ground > 0.8 * own.ground.max())
-    if own.base > 0 and apart.any():
-        gains[0] = np.median(x[apart] / ground[apart])
+    ground, excess, known = moved.pulled(own.ground), moved.pulled(own.above), moved.known()
+    clear_ground = known & (excess < 0.1 * own.level) & (ground > 0.8 * own.ground.max())
+    if own.base > 0 and clear_ground.any():
+        gains[0] = np.median(x[clear_ground] / ground[clear_ground])
     label = np.where(known, label, 0)
     order = np.argsort(label, axis=None, kind="stable")
-    ends = np.searchsorted(label.ravel()[order], np.arange(gains.size + 1))
-    flat, high, low = x.ravel(), above.ravel(), ground.ravel()
+    first_of_label = np.searchsorted(label.ravel()[order], np.arange(gains.size + 1))
+    flat, high, low = x.ravel(), excess.ravel(), ground.ravel()
     for k in range(1, gains.size):
-        inside = order[ends[k] : ends[k + 1]]
-        a = high[inside]
+        voxels = order[first_of_label[k] : first_of_label[k + 1]]
+        a = high[voxels]
         if a.size > 4 and (top := 0.75 * np.percentile(a, 90)) > 0:
-            inside, a = inside[a > top], a[a > top]
-            gains[k] = np.median((flat[inside] - gains[0] * low[inside]) / a)
+            voxels, a = voxels[a > top], a[a > top]
+            gains[k] = np.median((flat[voxels] - gains[0] * low[voxels]) / a)
     return np.maximum(gains, 0)

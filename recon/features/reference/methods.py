@@ -30,12 +30,12 @@ from recon.voxels.voxel_problem import Buffers, VoxelProblem, bytes_of, times_po
 
 _ROUNDS = PLAN[2:]
 # largest number of iterations of a round; rounds with falling weights, and iterations of each
-_FIRST, _SHARPER, _LAST = 8, 2, 12
-_AT_FIRST = Buffers(8.0, 3.0, 3.5)  # when the reference is put on the voxels
+_FIRST_ROUNDS, _SHARPENING_ROUNDS, _LAST_ROUNDS = 8, 2, 12
+_START_BUFFERS = Buffers(8.0, 3.0, 3.5)  # when the reference is put on the voxels
 # Peaks measured, in volumes: 54 in a slab of 16 rows, with 48 rows of the reference; 42 in 64 rows that all of the
 # reference is in.
 _BUFFERS, _PLACED = Buffers(40.0, 7.0, 3.5, filtered=True), 5
-_ON_HALVES = Buffers(20.0, 7.0, 3.5)  # in volumes of half voxels
+_HALF_VOXEL_BUFFERS = Buffers(20.0, 7.0, 3.5)  # in volumes of half voxels
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,14 +95,14 @@ class FromReference(Method):
         if verdict.used:  # the decisions of slabs with the reference are not those of this method
             control = replace(control, decide=Decisions(problem.seed))
             because = "the reference shows no material in this part of the volume"
-        made = self.otherwise.run_chosen(choice, problem, control)
-        settings = {**made.settings, "reference_used": False, "reference_because": because}
-        return replace(made, settings=settings, chosen=f"The reference was not used: {because}. {made.chosen}")
+        result = self.otherwise.run_chosen(choice, problem, control)
+        settings = {**result.settings, "reference_used": False, "reference_because": because}
+        return replace(result, settings=settings, chosen=f"The reference was not used: {because}. {result.chosen}")
 
     def _asked(self, choice: TrialChoice, trials: list[Trial | None]) -> ReferenceVerdict:
         trial = trials[0] if trials else None
         if trial is None or trial.settings.all_rows:
-            return ReferenceVerdict(False, f"whether it helps cannot be tested ({choice.where})")
+            return ReferenceVerdict(False, f"whether it helps cannot be tested ({choice.part_of_scan})")
         if self.reference is None:
             return ReferenceVerdict(False, "none was given")
         return asked(trial, choice, self.reference)
@@ -114,7 +114,7 @@ class FromReference(Method):
         assert self.reference is not None and control.decide is not None
         begin, history = control.now(), list[Progress]()
         halves = uses_half_voxels(self.half_voxels, problem.geometry, problem.grid)
-        planned = (1 + len(_ROUNDS)) * _FIRST + (_SHARPER + COST * halves) * _LAST
+        planned = (1 + len(_ROUNDS)) * _FIRST_ROUNDS + (_SHARPENING_ROUNDS + COST * halves) * _LAST_ROUNDS
 
         def report(iteration: int, residual: float) -> None:
             seconds = control.now() - begin
@@ -160,14 +160,16 @@ class FromReference(Method):
         return replace(self, otherwise=self.otherwise.toy())
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        own, given = (0, None) if self.reference is None else (self.reference.data.nbytes, self.reference.grid)
-        placed, smoothed = bytes_placed(given, grid, MARGIN)
-        at_first = bytes_of(_AT_FIRST, geometry, grid, weighted) + placed + smoothed
+        reference_bytes, reference_grid = (
+            (0, None) if self.reference is None else (self.reference.data.nbytes, self.reference.grid)
+        )
+        placed, smoothed = bytes_placed(reference_grid, grid, MARGIN)
+        at_first = bytes_of(_START_BUFFERS, geometry, grid, weighted) + placed + smoothed
         later = bytes_of(_BUFFERS, geometry, grid, weighted) + _PLACED * placed
         if uses_half_voxels(self.half_voxels, geometry, grid):
-            on_halves = bytes_of(_ON_HALVES, geometry, halved(grid), weighted)
+            on_halves = bytes_of(_HALF_VOXEL_BUFFERS, geometry, halved(grid), weighted)
             later = max(later, on_halves + _PLACED * placed)
-        return own + max(at_first, later, self.otherwise.memory(geometry, grid, weighted))
+        return reference_bytes + max(at_first, later, self.otherwise.memory(geometry, grid, weighted))
 
 
 class _State:
@@ -205,10 +207,10 @@ class _State:
             problem.first_sweep(x, problem.rng)
             start = np.where(moved.known(), start, x)
         fit = StateFit(problem, moved, start.astype(np.float32), weight, width)
-        fit.rounds(_ROUNDS, _FIRST)
+        fit.rounds(_ROUNDS, _FIRST_ROUNDS)
         # on whole voxels, faint lines cost 0.1 to 0.2 dB, and cracks become no deeper
-        fit.sharpen(_SHARPER, most=_LAST, lines_from=ALL_LINES if self._halves else CLEAR_LINES)
-        if self._halves and (count := fit.on_half_voxels(most=_LAST)):
+        fit.sharpen(_SHARPENING_ROUNDS, iterations=_LAST_ROUNDS, lines_from=ALL_LINES if self._halves else CLEAR_LINES)
+        if self._halves and (count := fit.on_half_voxels(iterations=_LAST_ROUNDS)):
             problem.decide.settings["half_voxel_iterations"] = count
         problem.decide.ended = None  # it describes only the last of several rounds
         self.moved = volume_slices(times_power(fit.m.copy(), problem.units.density))

@@ -28,9 +28,9 @@ from recon.voxels.voxel_problem import VoxelProblem
 # smallest number of slices with which the motion along the axis is estimated; with fewer slices it is assumed to be 0
 _TALL = 8
 _VIEWS = 40  # largest number of projections from which the motion is estimated
-_TURNS = np.radians(np.arange(-3.75, 3.8, 0.75))  # rotations about the axis that are tried first
-_MOST = 16  # largest shift in voxels that is tried first; a tenth of the width if that is larger
-_ACROSS = 96  # largest number of voxels across, with which rotations and shifts are tried
+_FIRST_ROTATIONS = np.radians(np.arange(-3.75, 3.8, 0.75))  # rotations about the axis that are tried first
+_LARGEST_SHIFT = 16  # largest shift in voxels that is tried first; a tenth of the width if that is larger
+_TRIAL_COLUMNS = 96  # largest number of voxels across, with which rotations and shifts are tried
 _BAND = 2.5, 10.0  # widths of two Gaussians in voxels; structure between these widths is compared
 _BLURS = 4, 4, 2, 1, 1  # blur in voxels of the steps towards the affine map
 _STEPS, _AFFINE_STEPS = 10, 6  # conjugate-gradient iterations of a step, for splines and for an affine map
@@ -75,8 +75,10 @@ class Basis:
         """
         edge = width / intervals
         z, y, x = grid.coordinates()
-        along = round(grid.shape[0] * grid.spacing[0] / edge)
-        functions = np.ones((z.size, 1)) if along < 2 else _splines(z - z.mean(), edge, along)
+        intervals_along_axis = round(grid.shape[0] * grid.spacing[0] / edge)
+        functions = (
+            np.ones((z.size, 1)) if intervals_along_axis < 2 else _splines(z - z.mean(), edge, intervals_along_axis)
+        )
         rows, cols = (_splines(coordinate, edge, intervals) for coordinate in (y, x))
         used = np.ones((intervals + 3, intervals + 3, functions.shape[1]))
         return cls(rows, cols, functions, used, 2 + (grid.shape[0] >= _TALL), intervals)
@@ -93,8 +95,8 @@ class Basis:
 
     def back(self, field: F32) -> F64:
         """The transpose of `field`."""
-        some = np.einsum("xq,ayxr->ayqr", self.x.astype(np.float32), field @ self.z.astype(np.float32))
-        return self.used * np.einsum("yp,ayqr->apqr", self.y, some.astype(np.float64))
+        without_y = np.einsum("xq,ayxr->ayqr", self.x.astype(np.float32), field @ self.z.astype(np.float32))
+        return self.used * np.einsum("yp,ayqr->apqr", self.y, without_y.astype(np.float64))
 
     def uniform_along_z(self) -> Basis:
         """The same functions of y and x, constant along the axis."""
@@ -109,9 +111,9 @@ class Basis:
         out = np.zeros_like(c)
         for axis in (1, 2, 3) if self.intervals else ():
             if c.shape[axis] > 2:
-                e, wide = np.diff(c, 2, axis), [(0, 0)] * 4
-                wide[axis] = (2, 2)
-                out += np.diff(np.pad(e, wide), 2, axis)
+                e, padding = np.diff(c, 2, axis), [(0, 0)] * 4
+                padding[axis] = (2, 2)
+                out += np.diff(np.pad(e, padding), 2, axis)
         return out
 
     def nearest(self, u: F32) -> F64:
@@ -164,30 +166,31 @@ class Moved:
         return out, derivatives
 
     def _places(self) -> list[F32]:
-        places = []
+        positions = []
         for axis, (start, n) in enumerate(zip(self.first, self.u.shape[1:], strict=True)):
             own = (np.arange(n, dtype=np.float32) + start).reshape([-1 if a == axis else 1 for a in range(3)])
-            places.append(own + self.u[axis])
-        return places
+            positions.append(own + self.u[axis])
+        return positions
 
     def labels(self) -> np.ndarray:
         """The particle of each voxel [y, x, z] of the state."""
         label = self.particles.label
         nearest = (
-            np.rint(place).astype(int).clip(0, n - 1) for place, n in zip(self._places(), label.shape, strict=True)
+            np.rint(position).astype(int).clip(0, n - 1)
+            for position, n in zip(self._places(), label.shape, strict=True)
         )
         return label[tuple(nearest)]
 
     def known(self) -> np.ndarray:
         """bool [y, x, z], True for voxels of the state whose place is inside the known part of the reference."""
-        places, shape = self._places(), self.particles.label.shape
-        inside = np.ones(self.u.shape[1:], bool)
-        for place, n in zip(places, shape, strict=True):
-            inside &= (place > -0.5) & (place < n - 0.5)
+        positions, shape = self._places(), self.particles.label.shape
+        is_inside = np.ones(self.u.shape[1:], bool)
+        for position, n in zip(positions, shape, strict=True):
+            is_inside &= (position > -0.5) & (position < n - 0.5)
         if self.radius < math.inf:
-            y, x = (place - (n - 1) / 2 for place, n in zip(places[:2], shape[:2], strict=True))
-            inside &= np.hypot(y, x) < self.radius
-        return inside
+            y, x = (position - (n - 1) / 2 for position, n in zip(positions[:2], shape[:2], strict=True))
+            is_inside &= np.hypot(y, x) < self.radius
+        return is_inside
 
     def volume(self) -> F32:
         """The moved reference [y, x, z]; 0 where it is not known."""
@@ -205,15 +208,15 @@ class MotionViews:
     @classmethod
     def of(cls, problem: VoxelProblem) -> MotionViews:
         angles = np.argsort(np.mod(problem.projector.geometry.angles, problem.projector.geometry.period), kind="stable")
-        some = np.sort(spread(angles, _VIEWS))
-        weight = None if problem.weight is None else problem.weight[some]
-        return cls(problem.projector.subset(some), problem.data[some], weight)
+        chosen = np.sort(spread(angles, _VIEWS))
+        weight = None if problem.weight is None else problem.weight[chosen]
+        return cls(problem.projector.subset(chosen), problem.data[chosen], weight)
 
     def weighed(self, lines: F32) -> F32:
         return lines if self.weight is None else lines * self.weight
 
 
-def improved(views: MotionViews, moved: Moved, basis: Basis, blur: float, beside: F32, with_gains: bool) -> Moved:
+def improved(views: MotionViews, moved: Moved, basis: Basis, blur: float, additional: F32, with_gains: bool) -> Moved:
     """The reference after a Gauss-Newton step towards the projections. Reference and projections are blurred by `blur`
     voxels in the plane of the slices.
 
@@ -221,7 +224,7 @@ def improved(views: MotionViews, moved: Moved, basis: Basis, blur: float, beside
     splines get softer as the fit improves.
 
     Args:
-        beside: a volume [y, x, z] that the projections show in addition to the moved reference.
+        additional: a volume [y, x, z] that the projections show in addition to the moved reference.
         with_gains: True: also fit one gain of the ground and one gain of all particles.
     """
 
@@ -229,17 +232,17 @@ def improved(views: MotionViews, moved: Moved, basis: Basis, blur: float, beside
         return ndi.gaussian_filter(volume, (blur, blur, 0)) if blur else volume
 
     own, known = moved.particles, moved.known()
-    now, slopes = moved.with_slopes(smooth(moved.at_rest))
+    reference, slopes = moved.with_slopes(smooth(moved.at_rest))
     assert slopes is not None
     slopes = slopes[: basis.axes] * known
     parts = [moved.pulled(smooth(part)) * known for part in (own.ground, own.above)] if with_gains else []
-    lines = views.lines - views.projector.forward_lines(beside) if beside.any() else views.lines
+    lines = views.lines - views.projector.forward_lines(additional) if additional.any() else views.lines
     residual = ndi.gaussian_filter1d(lines, blur, axis=1) if blur else lines
-    residual = residual - views.projector.forward_lines(now * known)
+    residual = residual - views.projector.forward_lines(reference * known)
     n, n_views = slopes.shape[2], len(residual)
-    kept, size = basis.squared().back(slopes**2), math.prod(basis.shape)
+    squared_slopes, size = basis.squared().back(slopes**2), math.prod(basis.shape)
     share = 1.0 if views.weight is None else float(views.weight.mean())
-    stiff = float(views.weighed(residual**2).mean()) * ((basis.intervals / KNOTS) ** 2 * _BENDING / n) ** 2
+    bending_weight = float(views.weighed(residual**2).mean()) * ((basis.intervals / KNOTS) ** 2 * _BENDING / n) ** 2
 
     def forward(v: F64) -> F32:
         change = np.einsum("ayxz,ayxz->yxz", slopes, basis.field(v[:size].reshape(basis.shape)))
@@ -247,21 +250,21 @@ def improved(views: MotionViews, moved: Moved, basis: Basis, blur: float, beside
             change += np.float32(gain) * part
         return views.weighed(views.projector.forward_lines(change))
 
-    def back(rays: F32) -> F64:
+    def transpose(rays: F32) -> F64:
         volume = views.projector.adjoint_lines(rays)
         of_u = basis.back(slopes * volume)
         return np.concatenate((of_u.ravel(), [float(np.vdot(volume, part)) for part in parts]))
 
     def normal(v: F64) -> F64:
-        out = back(forward(v))
-        out[:size] += stiff * basis.bending(v[:size].reshape(basis.shape)).ravel()
+        out = transpose(forward(v))
+        out[:size] += bending_weight * basis.bending(v[:size].reshape(basis.shape)).ravel()
         return out
 
-    of_u = share * 4 * kept + 6 * stiff / n_views
+    of_u = share * 4 * squared_slopes + 6 * bending_weight / n_views
     scale = np.concatenate((of_u.ravel(), [share * float(np.square(part).sum()) * n / 4 for part in parts]))
     scale = n_views * scale + 1e-12
     steps = _STEPS if basis.intervals else _AFFINE_STEPS
-    step = conjugate(normal, back(views.weighed(residual)), lambda r: r / scale, steps)
+    step = conjugate(normal, transpose(views.weighed(residual)), lambda r: r / scale, steps)
     u, gains = moved.u.copy(), moved.gains.copy()
     u[: basis.axes] += basis.field(step[:size].reshape(basis.shape))
     if with_gains:
@@ -270,20 +273,20 @@ def improved(views: MotionViews, moved: Moved, basis: Basis, blur: float, beside
     return replace(moved, u=u, gains=np.maximum(gains, 0))
 
 
-def conjugate(normal: Callable[[F64], F64], right: F64, scaled: Callable[[F64], F64], iterations: int) -> F64:
+def conjugate(normal: Callable[[F64], F64], right_side: F64, scaled: Callable[[F64], F64], iterations: int) -> F64:
     """Conjugate-gradient iterations (Hestenes & Stiefel 1952) from 0. `scaled` is the preconditioner."""
-    x, r = np.zeros_like(right), right.copy()
+    x, r = np.zeros_like(right_side), right_side.copy()
     z = scaled(r)
     p, rz = z.copy(), float(r @ z)
     for _ in range(iterations):
         q = normal(p)
-        if not (curved := float(p @ q)) > 0:
+        if not (curvature := float(p @ q)) > 0:
             break
-        a = rz / curved
+        a = rz / curvature
         x, r = x + a * p, r - a * q
-        z, before = scaled(r), rz
+        z, last_rz = scaled(r), rz
         rz = float(r @ z)
-        p = z + rz / before * p
+        p = z + rz / last_rz * p
     return x
 
 
@@ -293,53 +296,53 @@ def roughly_moved(moved: Moved, x: F32, grid: Grid, width: float) -> F64:
 
     Both volumes are filtered by the difference of two Gaussians, so that neither levels nor noise count.
     """
-    basis, factor = Basis.affine(grid, width), math.ceil(x.shape[1] / _ACROSS)
-    still = replace(moved, u=np.zeros_like(moved.u))
+    basis, factor = Basis.affine(grid, width), math.ceil(x.shape[1] / _TRIAL_COLUMNS)
+    unmoved = replace(moved, u=np.zeros_like(moved.u))
 
     def band(volume: F32) -> F32:
         v = volume[::factor, ::factor]
         low, high = (ndi.gaussian_filter(v, (s / factor, s / factor, 0)) for s in _BAND)
         return low - high
 
-    target = fft.rfftn(band(x * still.known()))
-    most = max(_MOST, x.shape[1] // 10) // factor
-    along = 0 if basis.axes == 2 else min(x.shape[2] // 4, _MOST)
+    target = fft.rfftn(band(x * unmoved.known()))
+    largest_shift = max(_LARGEST_SHIFT, x.shape[1] // 10) // factor
+    largest_axial_shift = 0 if basis.axes == 2 else min(x.shape[2] // 4, _LARGEST_SHIFT)
     best = (-math.inf, basis.used * 0)
     reference = moved.particles.volume
-    for turn in _TURNS:
-        c = _turned(basis, turn, (0.0, 0.0, 0.0), width / grid.voxel_size)
-        there = replace(still, u=padded(basis.field(c)))
-        product = fft.irfftn(target * np.conj(fft.rfftn(band(there.pulled(reference)))), s=band(x).shape)
-        offsets = [np.arange(-m, m + 1) for m in (most, most, along)]
-        some = product[np.ix_(*offsets)]
-        j, i, k = np.unravel_index(some.argmax(), some.shape)
+    for rotation in _FIRST_ROTATIONS:
+        c = _turned(basis, rotation, (0.0, 0.0, 0.0), width / grid.voxel_size)
+        rotated = replace(unmoved, u=padded(basis.field(c)))
+        product = fft.irfftn(target * np.conj(fft.rfftn(band(rotated.pulled(reference)))), s=band(x).shape)
+        offsets = [np.arange(-m, m + 1) for m in (largest_shift, largest_shift, largest_axial_shift)]
+        correlations = product[np.ix_(*offsets)]
+        j, i, k = np.unravel_index(correlations.argmax(), correlations.shape)
         shift = (-factor * float(offsets[0][j]), -factor * float(offsets[1][i]), -float(offsets[2][k]))
-        if some.max() > best[0]:
-            best = float(some.max()), _turned(basis, turn, shift, width / grid.voxel_size)
+        if correlations.max() > best[0]:
+            best = float(correlations.max()), _turned(basis, rotation, shift, width / grid.voxel_size)
     return np.asarray(best[1])
 
 
-def _turned(basis: Basis, turn: float, shift: Sequence[float], across: float) -> F64:
-    """Coefficients of a shift (y, x, z) in voxels, followed by a rotation about the axis. `across` is the width in
+def _turned(basis: Basis, rotation: float, shift: Sequence[float], diameter: float) -> F64:
+    """Coefficients of a shift (y, x, z) in voxels, followed by a rotation about the axis. `diameter` is the width in
     voxels.
     """
     c = np.zeros(basis.shape)
-    cos, sin, half = math.cos(turn), math.sin(turn), across / 2
+    cos, sin, radius = math.cos(rotation), math.sin(rotation), diameter / 2
     dy, dx, dz = shift
     c[0, 0, 0, 0], c[1, 0, 0, 0] = cos * dy + sin * dx, cos * dx - sin * dy
-    c[0, 1, 0, 0], c[0, 0, 1, 0] = (cos - 1) * half, sin * half
-    c[1, 0, 1, 0], c[1, 1, 0, 0] = (cos - 1) * half, -sin * half
+    c[0, 1, 0, 0], c[0, 0, 1, 0] = (cos - 1) * radius, sin * radius
+    c[1, 0, 1, 0], c[1, 1, 0, 0] = (cos - 1) * radius, -sin * radius
     if basis.axes == 3:
         c[2, 0, 0, 0] = dz
     return c
 
 
-def affinely_moved(views: MotionViews, moved: Moved, basis: Basis, beside: F32) -> Moved:
+def affinely_moved(views: MotionViews, moved: Moved, basis: Basis, additional: F32) -> Moved:
     """The reference after steps on an affine map and two gains, from coarse to fine. The arguments are those of
     `improved`.
     """
     for blur in _BLURS:
-        moved = improved(views, moved, basis, blur, beside, True)
+        moved = improved(views, moved, basis, blur, additional, True)
     return moved
 
 

@@ -26,7 +26,7 @@ UNKNOWNS = 5  # unknowns of a particle: gain, growth of the diameter, shift alon
 MEASURED = np.vstack((np.eye(UNKNOWNS), (1, 3, 0, 0, 0)))
 """The unknowns, and the change of the mass, which follows from the gain and the growth."""
 _PRIOR = 1.0, 0.1, 3.0, 3.0, 3.0  # standard deviations of the unknowns, much larger than what is expected
-_LARGEST = 1.0, 0.05, 1.5, 1.5, 1.5  # largest step of an unknown in a round
+_LARGEST_STEPS = 1.0, 0.05, 1.5, 1.5, 1.5  # largest step of an unknown in a round
 _HALVES = 25  # iterations with half of the projections
 _CRACK = 8  # iterations for the excess of cracked particles that their shape does not explain
 _SOLID = 0.5  # share of a particle's level above which a voxel is inside the particle
@@ -60,16 +60,16 @@ class ParticleEstimate:
     Attributes:
         gain: [particle], 1 means unchanged from the reference.
         scale: [particle], factor of the diameter.
-        place: [particle, (y, x, z)], position in voxels of the state.
-        turn: [3, 3], the rotation of all particles.
+        position: [particle, (y, x, z)], position in voxels of the state.
+        rotation: [3, 3], the rotation of all particles.
         rest: change of the gain of everything that is not a particle.
         sharper: factor, in voxels², on the negative Laplacian of the particles that is added to them.
     """
 
     gain: F64
     scale: F64
-    place: F64
-    turn: F64
+    position: F64
+    rotation: F64
     rest: float = 0.0
     sharper: float = 0.0
 
@@ -90,30 +90,30 @@ class Patch:
     laplacian: F32
 
 
-def patch_of(body: Body, gain: float, scale: float, place: F64, turn: F64, shape: Sequence[int]) -> Patch | None:
+def patch_of(body: Body, gain: float, scale: float, position: F64, rotation: F64, shape: Sequence[int]) -> Patch | None:
     """The particle in a state, on the voxels of a volume of this shape (y, x, z). None: the particle lies outside."""
-    half = np.array(body.spline.shape) / 2
-    reach = scale * (np.abs(turn) @ half) + 1
-    middle = place + scale * turn @ (body.first + half - 0.5 - body.centre)
+    half_size = np.array(body.spline.shape) / 2
+    reach = scale * (np.abs(rotation) @ half_size) + 1
+    middle = position + scale * rotation @ (body.first + half_size - 0.5 - body.centre)
     low = np.maximum(np.floor(middle - reach).astype(int), 0)
     high = np.minimum(np.ceil(middle + reach).astype(int) + 1, shape)
     if (high - low < 1).any():
         return None
     wide_low, wide = low - 1, high - low + 2  # one more voxel on each side, for the slopes
-    matrix = turn.T / scale
-    offset = body.centre - body.first + matrix @ (wide_low - place)
+    matrix = rotation.T / scale
+    offset = body.centre - body.first + matrix @ (wide_low - position)
     wider = ndimage.affine_transform(
         body.spline, matrix, offset, tuple(wide), order=3, mode="constant", prefilter=False
     )
-    shown = wider[1:-1, 1:-1, 1:-1]
+    particle = wider[1:-1, 1:-1, 1:-1]
     slopes = np.stack([
         (np.roll(wider, -1, axis) - np.roll(wider, 1, axis))[1:-1, 1:-1, 1:-1] / 2 for axis in range(3)
     ])  # fmt: skip
-    laplacian = 6 * shown - sum(np.roll(wider, s, axis)[1:-1, 1:-1, 1:-1] for axis in range(3) for s in (-1, 1))
+    laplacian = 6 * particle - sum(np.roll(wider, s, axis)[1:-1, 1:-1, 1:-1] for axis in range(3) for s in (-1, 1))
     distances = [(np.arange(a, b) - c).reshape([-1 if i == axis else 1 for i in range(3)])
-          for axis, (a, b, c) in enumerate(zip(low, high, place, strict=True))]  # fmt: skip
-    growth = -sum(away * slope for away, slope in zip(distances, slopes, strict=True)) / scale
-    columns = np.concatenate((shown[None], gain * growth[None], -gain * slopes)).astype(np.float32)
+          for axis, (a, b, c) in enumerate(zip(low, high, position, strict=True))]  # fmt: skip
+    growth = -sum(distance * slope for distance, slope in zip(distances, slopes, strict=True)) / scale
+    columns = np.concatenate((particle[None], gain * growth[None], -gain * slopes)).astype(np.float32)
     box = tuple(slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))
     return Patch((box[0], box[1], box[2]), columns, laplacian.astype(np.float32))
 
@@ -169,8 +169,8 @@ class Linear:
     @classmethod
     def of(cls, views: StateViews, bodies: Sequence[Body], now: ParticleEstimate) -> Linear:
         patches = [
-            patch_of(body, g, s, c, now.turn, views.shape)
-            for body, g, s, c in zip(bodies, now.gain, now.scale, now.place, strict=True)
+            patch_of(body, g, s, c, now.rotation, views.shape)
+            for body, g, s, c in zip(bodies, now.gain, now.scale, now.position, strict=True)
         ]
         volume = views.rest + np.float32(now.rest) * views.smooth
         for patch, gain in zip(patches, now.gain, strict=True):
@@ -251,10 +251,10 @@ class Linear:
         order = np.argsort(np.mod(angles.angles, angles.period), kind="stable")
         halves = []
         for k in (0, 1):
-            some = np.sort(order[k::2])
+            views_of_half = np.sort(order[k::2])
             half = replace(
-                self, views=self.views.subset(some), residual=self.residual[some], blocks=self.blocks / 2,
-                others=self.others / 2, prior=self.prior / 2,
+                self, views=self.views.subset(views_of_half), residual=self.residual[views_of_half],
+                blocks=self.blocks / 2, others=self.others / 2, prior=self.prior / 2,
             )  # fmt: skip
             halves.append(half.solved(half.residual, _HALVES)[:-2].reshape(-1, UNKNOWNS) @ MEASURED.T)
         noise = float((self.views.weight * self.residual**2).sum() / max(self.views.weight.sum(), 1e-30))
@@ -288,11 +288,11 @@ def improved_rounds(
     for each in iterations:
         linear = Linear.of(views, bodies, now)
         step = linear.solved(linear.residual, each)
-        theta = np.clip(step[:-2].reshape(-1, UNKNOWNS), -np.array(_LARGEST), _LARGEST)
+        theta = np.clip(step[:-2].reshape(-1, UNKNOWNS), -np.array(_LARGEST_STEPS), _LARGEST_STEPS)
         theta[[patch is None for patch in linear.patches]] = 0
         now = replace(
             now, gain=np.maximum(now.gain + theta[:, 0], 0), scale=np.clip(now.scale + theta[:, 1], 0.5, 2),
-            place=now.place + theta[:, 2:], rest=now.rest + step[-2], sharper=now.sharper + step[-1],
+            position=now.position + theta[:, 2:], rest=now.rest + step[-2], sharper=now.sharper + step[-1],
         )  # fmt: skip
     return now
 
@@ -301,7 +301,7 @@ def inside_of(views: StateViews, bodies: Sequence[Body], now: ParticleEstimate, 
     """[y, x, z] 1 inside these particles, 0 elsewhere."""
     mask = np.zeros(views.shape, np.float32)
     for k in np.flatnonzero(which).tolist():
-        patch = patch_of(bodies[k], 1.0, now.scale[k], now.place[k], now.turn, views.shape)
+        patch = patch_of(bodies[k], 1.0, now.scale[k], now.position[k], now.rotation, views.shape)
         if patch is not None:
             mask[patch.box] = np.maximum(mask[patch.box], patch.columns[0] > _SOLID * bodies[k].level)
     return mask

@@ -39,20 +39,21 @@ Verdict = Literal["as before", "cracked", "closed", "gone", "not seen"]
 _HALO = 3  # voxels around the label of a particle that count as part of the particle
 _SHELL = 2  # thickness in voxels of the shell around them, in which the level around the particle is measured
 _CORE = 2  # least distance from the surface, in voxels, of the voxels from which the level of a particle is computed
-_LARGEST = 0.25  # share of the volume's voxels: a larger label is not a particle, but a wall or the whole sample
-_SMOOTH = 3.0  # width in voxels of the Gaussian that removes the noise of `rest`
+# share of the volume's voxels: a larger label is not a particle, but a wall or the whole sample
+_LARGEST_PARTICLE_SHARE = 0.25
+_REST_BLUR = 3.0  # width in voxels of the Gaussian that removes the noise of `rest`
 # width in pixels of the Gaussian that smooths line integrals for weights, so that the weights do not depend on the
 # noise of the same pixels
 _BLUR = 4.0
 _SPLINES = (4, 2.0), (6, 1.0)  # number of intervals, and blur in voxels, of the steps after the affine map
 _MOTION_VIEWS = 40
 # relative differences of gain and of diameter from the median, within which most particles of the same sample lie
-_SAME = 0.3, 0.1
+_MATCH_TOLERANCES = 0.3, 0.1
 # if the sample is the same: smallest share of these particles, and smallest median of the gain
-_MOST, _LEAST_GAIN = 0.65, 0.5
-_GONE = 0.3  # a particle with a smaller gain is gone
-_SEEN = 0.5  # smallest share of a particle that must lie in rows that are used
-_CLEAR = 3.0  # standard deviations by which a cracked particle has less mass than the others
+_LEAST_MATCH_SHARE, _LEAST_GAIN = 0.65, 0.5
+_GONE_GAIN = 0.3  # a particle with a smaller gain is gone
+_LEAST_SEEN_SHARE = 0.5  # smallest share of a particle that must lie in rows that are used
+_CLEAR_DEVIATIONS = 3.0  # standard deviations by which a cracked particle has less mass than the others
 _TYPICAL = 8  # if there are at least so many whole particles, the spread is computed from these only
 _LEAST_CRACK = 0.01  # smallest share of a particle that must be missing in a crack
 
@@ -84,8 +85,8 @@ class ReferenceParticles:
     @property
     def cut(self) -> NDArray[np.bool_]:
         """bool [body], True if the body touches the lowest or the highest slice."""
-        ends = np.unique(self.owner[:, :, [0, -1]])
-        return np.isin(np.arange(1, len(self.bodies) + 1), ends)
+        bodies_at_ends = np.unique(self.owner[:, :, [0, -1]])
+        return np.isin(np.arange(1, len(self.bodies) + 1), bodies_at_ends)
 
 
 def reference_particles(volume: F32, labels: Numbers, grid: Grid) -> ReferenceParticles:
@@ -98,7 +99,7 @@ def reference_particles(volume: F32, labels: Numbers, grid: Grid) -> ReferencePa
         ValueError: none of the labels is a particle.
     """
     counts = np.bincount(labels.ravel())
-    kept = np.flatnonzero((counts > 0) & (counts < _LARGEST * labels.size))
+    kept = np.flatnonzero((counts > 0) & (counts < _LARGEST_PARTICLE_SHARE * labels.size))
     kept = kept[kept > 0]
     if not kept.size:
         raise ValueError("no particle was found in the reference; give --materials and --particles")
@@ -106,22 +107,22 @@ def reference_particles(volume: F32, labels: Numbers, grid: Grid) -> ReferencePa
     number[kept] = np.arange(1, kept.size + 1)
     own = np.ascontiguousarray(number[labels].transpose(1, 2, 0))
     v = volume_lines(volume) * np.float32(grid.voxel_size)
-    away, near = ndimage.distance_transform_edt(own == 0, return_indices=True)
-    owner = np.where(away <= _HALO, own[tuple(near)], 0).astype(np.int32)
-    shell = (away > _HALO) & (away <= _HALO + _SHELL)
+    distance, nearest = ndimage.distance_transform_edt(own == 0, return_indices=True)
+    owner = np.where(distance <= _HALO, own[tuple(nearest)], 0).astype(np.int32)
+    shell = (distance > _HALO) & (distance <= _HALO + _SHELL)
     around = float(np.median(v[shell])) if shell.any() else 0.0
     depth, rest, bodies = ndimage.distance_transform_edt(own > 0), v.copy(), []
     for k, box in enumerate(ndimage.find_objects(owner), 1):
         mine = owner[box] == k
-        above = np.where(mine, v[box] - np.float32(around), 0).astype(np.float32)
-        rest[box] -= above
+        excess = np.where(mine, v[box] - np.float32(around), 0).astype(np.float32)
+        rest[box] -= excess
         solid = own[box] == k
         core = solid & (depth[box] >= _CORE)
-        level = float(above[core if core.any() else solid].mean())
+        level = float(excess[core if core.any() else solid].mean())
         first = np.array([each.start for each in box], float)
-        centre = first + ndimage.center_of_mass(np.where(solid, np.maximum(above, 0) + 1e-12, 0))
-        spline = ndimage.spline_filter(np.pad(above, 2), 3, output=np.float32)
-        bodies.append(Body(int(kept[k - 1]), spline, first - 2, centre, level, float(np.square(above).sum())))
+        centre = first + ndimage.center_of_mass(np.where(solid, np.maximum(excess, 0) + 1e-12, 0))
+        spline = ndimage.spline_filter(np.pad(excess, 2), 3, output=np.float32)
+        bodies.append(Body(int(kept[k - 1]), spline, first - 2, centre, level, float(np.square(excess).sum())))
     return ReferenceParticles(v, rest, owner, tuple(bodies), around, grid, counts[kept])
 
 
@@ -151,12 +152,15 @@ class ParticleFit:
     @property
     def matches(self) -> bool:
         """True if this state contains most particles of the reference, so that it is the same sample."""
-        seen = self.seen >= _SEEN
+        seen = self.seen >= _LEAST_SEEN_SHARE
         gain, scale = self.estimate.gain[seen], self.estimate.scale[seen]
         if not gain.size or np.median(gain) < _LEAST_GAIN:
             return False
-        near = [np.abs(each / np.median(each) - 1) < most for each, most in zip((gain, scale), _SAME, strict=True)]
-        return bool((near[0] & near[1]).mean() > _MOST)
+        is_near = [
+            np.abs(values / np.median(values) - 1) < tolerance
+            for values, tolerance in zip((gain, scale), _MATCH_TOLERANCES, strict=True)
+        ]
+        return bool((is_near[0] & is_near[1]).mean() > _LEAST_MATCH_SHARE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,35 +192,39 @@ def numbers_of(reference: ReferenceParticles, fit: ParticleFit) -> StateNumbers:
     lower grey level in a larger volume.
     """
     changes, deviation = fit.measured, fit.noise
-    seen = (fit.seen >= _SEEN) & fit.matches
-    gone = seen & (changes[:, 0] + 1 < _GONE)
-    some = seen & ~gone
-    verdict = np.where(seen, np.where(gone, "gone", "as before"), "not seen").astype("<U9")
-    if some.any():
-        typical = some & ~reference.cut if (some & ~reference.cut).sum() >= _TYPICAL else some
-        (lost, of_mass), (wider, of_scale) = (_away(changes[:, j], deviation[:, j], typical) for j in (5, 1))
-        least = np.maximum(_CLEAR * of_mass, _LEAST_CRACK)
+    seen = (fit.seen >= _LEAST_SEEN_SHARE) & fit.matches
+    is_gone = seen & (changes[:, 0] + 1 < _GONE_GAIN)
+    is_present = seen & ~is_gone
+    verdict = np.where(seen, np.where(is_gone, "gone", "as before"), "not seen").astype("<U9")
+    if is_present.any():
+        typical = is_present & ~reference.cut if (is_present & ~reference.cut).sum() >= _TYPICAL else is_present
+        (mass_change, mass_deviation), (scale_change, scale_deviation) = (
+            _relative_to_others(changes[:, j], deviation[:, j], typical) for j in (5, 1)
+        )
+        least_loss = np.maximum(_CLEAR_DEVIATIONS * mass_deviation, _LEAST_CRACK)
         for name, sign in (("cracked", 1), ("closed", -1)):
-            outlier = (sign * wider > _CLEAR * of_scale) & (sign * lost < -of_mass)
-            verdict[some & ((sign * lost < -least) | outlier)] = name
+            outlier = (sign * scale_change > _CLEAR_DEVIATIONS * scale_deviation) & (
+                sign * mass_change < -mass_deviation
+            )
+            verdict[is_present & ((sign * mass_change < -least_loss) | outlier)] = name
     changes, edge = np.where(seen[:, None], changes, np.nan), reference.grid.voxel_size
-    changes[gone, 1:] = np.nan
+    changes[is_gone, 1:] = np.nan
     level = np.array([body.level for body in reference.bodies])
-    before = (level + reference.around) / edge
-    around = reference.around * (1 + fit.estimate.rest)
-    grey = _interval((around + level * (1 + changes[:, 0])) / edge, level * deviation[:, 0] / edge)
+    reference_grey = (level + reference.around) / edge
+    level_around = reference.around * (1 + fit.estimate.rest)
+    grey = _interval((level_around + level * (1 + changes[:, 0])) / edge, level * deviation[:, 0] / edge)
     scale = _interval(1 + changes[:, 1], deviation[:, 1])
     shift = edge * _interval(changes[:, [4, 2, 3]], deviation[:, [4, 2, 3]])
-    return StateNumbers(grey, grey / before[:, None] - 1, scale**3 - 1, shift, tuple(verdict.tolist()))
+    return StateNumbers(grey, grey / reference_grey[:, None] - 1, scale**3 - 1, shift, tuple(verdict.tolist()))
 
 
-def _away(value: F64, deviation: F64, some: NDArray[np.bool_]) -> tuple[F64, F64]:
-    """The differences of values from the median of `some`, and the standard deviations of these differences, which
+def _relative_to_others(value: F64, deviation: F64, others: NDArray[np.bool_]) -> tuple[F64, F64]:
+    """The differences of values from the median of `others`, and the standard deviations of these differences, which
     combine the error of a value with the spread of all values.
     """
-    away = value - np.median(value[some])
-    spread_ = np.square(1.4826 * np.median(np.abs(away[some]))) - np.median(np.square(deviation[some]))
-    return away, np.sqrt(np.square(deviation) + max(float(spread_), 0.0))
+    differences = value - np.median(value[others])
+    variance = np.square(1.4826 * np.median(np.abs(differences[others]))) - np.median(np.square(deviation[others]))
+    return differences, np.sqrt(np.square(deviation) + max(float(variance), 0.0))
 
 
 def _interval(value: F64, deviation: F64) -> F64:
@@ -244,38 +252,38 @@ def fit_state(
     if weights is not None:
         weight *= projection_lines(weights)
     offset = (np.array(grid.first) - np.array(reference.grid.first) / edge)[[1, 2, 0]]
-    u, turn = _moved(reference, projector, p, weight, offset)
+    u, rotation = _measured_motion(reference, projector, p, weight, offset)
     tell()
-    places = _places_of(reference, u, offset)
+    positions = _places_of(reference, u, offset)
     sampled = _sampled(u, offset)
     rest = ndimage.map_coordinates(reference.rest, sampled, order=1, mode="nearest")
     known = ((sampled[2] > -0.5) & (sampled[2] < reference.rest.shape[2] - 0.5)).all((0, 1))
     weight[:, :, ~_rows_of(known, geometry, grid)] = 0
-    views = StateViews(projector, p, weight, rest, ndimage.gaussian_filter(rest, _SMOOTH), known)
+    views = StateViews(projector, p, weight, rest, ndimage.gaussian_filter(rest, _REST_BLUR), known)
     n = len(reference.bodies)
-    estimate = ParticleEstimate(np.ones(n), np.ones(n), places, turn)
+    estimate = ParticleEstimate(np.ones(n), np.ones(n), positions, rotation)
     estimate = improved_rounds(views, reference.bodies, estimate, (10, 20))
     tell()
     tell()
-    dark = inside_of(views, reference.bodies, estimate, _less(estimate))
+    dark = inside_of(views, reference.bodies, estimate, _has_less_mass(estimate))
     if dark.any():
         views = replace(views, lines=p - projector.forward_lines(unexplained(views, reference.bodies, estimate, dark)))
     tell()
     estimate = improved_rounds(views, reference.bodies, estimate, (20,))
     tell()
     linear = Linear.of(views, reference.bodies, estimate)
-    noise = linear.noise_by_halves(~_less(estimate))
+    noise = linear.noise_by_halves(~_has_less_mass(estimate))
     tell()
-    shift = estimate.place - np.array([body.centre for body in reference.bodies]) + offset
+    shift = estimate.position - np.array([body.centre for body in reference.bodies]) + offset
     return ParticleFit(estimate, noise, linear.seen, shift)
 
 
-def _less(estimate: ParticleEstimate) -> NDArray[np.bool_]:
+def _has_less_mass(estimate: ParticleEstimate) -> NDArray[np.bool_]:
     """bool [body], True if the body has clearly less mass than most bodies."""
     mass = estimate.gain * estimate.scale**3
     middle = float(np.median(mass))
-    spread_ = 1.4826 * float(np.median(np.abs(mass - middle)))
-    return mass < middle - np.maximum(_CLEAR * spread_, _LEAST_CRACK)
+    deviation = 1.4826 * float(np.median(np.abs(mass - middle)))
+    return mass < middle - np.maximum(_CLEAR_DEVIATIONS * deviation, _LEAST_CRACK)
 
 
 def _rows_of(known: NDArray[np.bool_], geometry: Geometry, grid: Grid) -> NDArray[np.bool_]:
@@ -286,37 +294,39 @@ def _rows_of(known: NDArray[np.bool_], geometry: Geometry, grid: Grid) -> NDArra
     return known[np.floor(slices).astype(int).clip(0, last)] & known[np.ceil(slices).astype(int).clip(0, last)]
 
 
-def _moved(reference: ReferenceParticles, projector: Projector, p: F32, weight: F32, offset: F64) -> tuple[F32, F64]:
+def _measured_motion(
+    reference: ReferenceParticles, projector: Projector, p: F32, weight: F32, offset: F64
+) -> tuple[F32, F64]:
     """The approximate motion of the whole sample: displacement u [3, y, x, z] in voxels, and the rotation that it
     contains.
     """
     grid, geometry = projector.grid, projector.geometry
     nz, ny, nx = grid.shape
-    still = np.zeros((3, ny, nx, nz), np.float32)
+    no_displacement = np.zeros((3, ny, nx, nz), np.float32)
     level = float(np.median([body.level for body in reference.bodies]))
     parts = Particles(
         reference.rest, reference.volume - reference.rest, np.minimum(reference.owner, 1), reference.around, level
     )
     first = np.rint(offset).astype(int).tolist()
-    moved = Moved(parts, (first[0], first[1], first[2]), still, np.ones(2))
+    moved = Moved(parts, (first[0], first[1], first[2]), no_displacement, np.ones(2))
     width = 2 * geometry.reach
     affine = Basis.affine(grid, width)
     lines = np.ascontiguousarray(p.transpose(0, 2, 1))
     fbp = volume_lines(reconstruct(lines, geometry, Fbp(), grid=grid).volume.data)
-    c = roughly_moved(moved, fbp, grid, width)
-    moved = replace(moved, u=padded(affine.field(c)))
+    affine_coefficients = roughly_moved(moved, fbp, grid, width)
+    moved = replace(moved, u=padded(affine.field(affine_coefficients)))
     order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
-    some = np.sort(spread(order, _MOTION_VIEWS))
-    views, nothing = MotionViews(projector.subset(some), p[some], weight[some]), np.zeros_like(fbp)
-    moved = affinely_moved(views, moved, affine, nothing)
-    c = affine.nearest(moved.u)
+    chosen = np.sort(spread(order, _MOTION_VIEWS))
+    views, no_addition = MotionViews(projector.subset(chosen), p[chosen], weight[chosen]), np.zeros_like(fbp)
+    moved = affinely_moved(views, moved, affine, no_addition)
+    affine_coefficients = affine.nearest(moved.u)
     # Places in the reference change by the identity plus these slopes from one voxel of the state to the next.
     slopes = np.eye(3)
     for axis, direction in enumerate(((1, 0, 0), (0, 1, 0), (0, 0, 1))):
-        slopes[: affine.axes, axis] += c[:, *direction] * 2 / width
+        slopes[: affine.axes, axis] += affine_coefficients[:, *direction] * 2 / width
     left, _, right = np.linalg.svd(slopes)
     for intervals, blur in _SPLINES:
-        moved = improved(views, moved, Basis.splines(grid, width, intervals), blur, nothing, False)
+        moved = improved(views, moved, Basis.splines(grid, width, intervals), blur, no_addition, False)
     return moved.u + np.float32(np.array(first) - offset).reshape(3, 1, 1, 1), (left @ right).T
 
 
@@ -331,12 +341,12 @@ def _sampled(u: F32, offset: F64) -> F32:
 
 def _places_of(reference: ReferenceParticles, u: F32, offset: F64) -> F64:
     """[body, (y, x, z)] position in the state of each body of the reference."""
-    goal = np.array([body.centre for body in reference.bodies]) - offset
-    place = goal.copy()
+    unshifted = np.array([body.centre for body in reference.bodies]) - offset
+    position = unshifted.copy()
     for _ in range(8):
-        place = goal - _shift_at(u, place)
-    return place
+        position = unshifted - _shift_at(u, position)
+    return position
 
 
-def _shift_at(u: F32, place: F64) -> F64:
-    return np.stack([ndimage.map_coordinates(part, place.T, order=1, mode="nearest") for part in u], axis=1)
+def _shift_at(u: F32, position: F64) -> F64:
+    return np.stack([ndimage.map_coordinates(part, position.T, order=1, mode="nearest") for part in u], axis=1)

@@ -15,7 +15,7 @@ from recon.base.arrays import F32
 from recon.base.volume import Grid, Volume
 
 _HULL = 8  # voxels by which gaps are closed, to find the material between particles
-_NEAR = 4  # voxels around a particle that count as part of the particle
+_RIM_VOXELS = 4  # voxels around a particle that count as part of the particle
 # smallest number of voxels from which the ground is measured; with fewer voxels, air is assumed between particles
 _LEAST_GROUND = 100
 _COARSER = 1.5  # size of a voxel, divided by that of the reference, above which it gets a mean of the reference
@@ -88,12 +88,12 @@ def _ground(v: F32, solid: NDArray[np.bool_], split: float) -> float:
 
 
 def _widened(label: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The labels, also of voxels within `_NEAR` of a particle: these get the label of the nearest particle."""
-    away, near = _to_nearest(label == 0)
-    wide = np.zeros_like(label)
-    for row, places in enumerate(near.swapaxes(0, 1)):
-        wide[row] = np.where(away[row] < _NEAR, label[tuple(places)], 0)
-    return wide
+    """The labels, also of voxels within `_RIM_VOXELS` of a particle: these get the label of the nearest particle."""
+    distance, nearest = _to_nearest(label == 0)
+    widened = np.zeros_like(label)
+    for row, nearest_voxels in enumerate(nearest.swapaxes(0, 1)):
+        widened[row] = np.where(distance[row] < _RIM_VOXELS, label[tuple(nearest_voxels)], 0)
+    return widened
 
 
 def _to_nearest(mask: NDArray[np.bool_]) -> tuple[F32, NDArray[np.int32]]:
@@ -102,12 +102,12 @@ def _to_nearest(mask: NDArray[np.bool_]) -> tuple[F32, NDArray[np.int32]]:
 
     The distances of `ndi.distance_transform_edt` need 12 volumes while they are computed; these need 6.
     """
-    near = ndi.distance_transform_edt(mask, return_distances=False, return_indices=True)
+    nearest = ndi.distance_transform_edt(mask, return_distances=False, return_indices=True)
     squared = np.zeros(mask.shape, np.float32)
     for axis, n in enumerate(mask.shape):
         own = np.arange(n, dtype=np.int32).reshape([-1 if a == axis else 1 for a in range(3)])
-        squared += np.square((near[axis] - own).astype(np.float32))
-    return np.sqrt(squared, out=squared), near
+        squared += np.square((nearest[axis] - own).astype(np.float32))
+    return np.sqrt(squared, out=squared), nearest
 
 
 def summits(depth: F32, solid: NDArray[np.bool_]) -> NDArray[np.int32]:
@@ -120,28 +120,31 @@ def summits(depth: F32, solid: NDArray[np.bool_]) -> NDArray[np.int32]:
     for row in range(ny):  # no two voxels have the same depth
         box[row + 1, 1:-1, 1:-1] = depth[row] + 1e-6 * uphill[row] / size
     for row in range(ny):
-        own, best = uphill[row].copy(), box[row + 1, 1:-1, 1:-1].copy()
+        labels, best = uphill[row].copy(), box[row + 1, 1:-1, 1:-1].copy()
         for y, x, z in np.ndindex(3, 3, 3):
-            beside = box[row + y, x : x + nx, z : z + nz]
-            better = beside > best
-            best[better], uphill[row][better] = beside[better], own[better] + ((y - 1) * nx + x - 1) * nz + z - 1
+            neighbours = box[row + y, x : x + nx, z : z + nz]
+            is_higher = neighbours > best
+            best[is_higher], uphill[row][is_higher] = (
+                neighbours[is_higher],
+                labels[is_higher] + ((y - 1) * nx + x - 1) * nz + z - 1,
+            )
     del box
     while sum(_climb(row, flat) for row in uphill):
         pass
     is_summit = np.zeros(size, bool)
-    for places, inside in zip(uphill, solid, strict=True):
-        is_summit[places[inside]] = True
+    for summit_of_voxel, is_solid in zip(uphill, solid, strict=True):
+        is_summit[summit_of_voxel[is_solid]] = True
     number, label = np.cumsum(is_summit, dtype=np.int32), np.zeros(depth.shape, np.int32)
-    for own, places, inside in zip(label, uphill, solid, strict=True):
-        own[inside] = number[places[inside]]
+    for labels, summit_of_voxel, is_solid in zip(label, uphill, solid, strict=True):
+        labels[is_solid] = number[summit_of_voxel[is_solid]]
     return label
 
 
-def _climb(places: NDArray[np.intp], uphill: NDArray[np.intp]) -> bool:
+def _climb(positions: NDArray[np.intp], uphill: NDArray[np.intp]) -> bool:
     """Move places on to where they lead; False if all of them are summits."""
-    further = uphill[places]
-    moved = not np.array_equal(places, further)
-    places[...] = further
+    next_positions = uphill[positions]
+    moved = not np.array_equal(positions, next_positions)
+    positions[...] = next_positions
     return moved
 
 
@@ -150,11 +153,11 @@ def require_finite(reference: Volume) -> None:
     particles.
     """
     voxels = reference.data
-    wrong = sum(int(np.count_nonzero(~np.isfinite(each))) for each in voxels)
-    if wrong:
+    n_not_finite = sum(int(np.count_nonzero(~np.isfinite(each))) for each in voxels)
+    if n_not_finite:
         raise ValueError(
-            f"{wrong} of {voxels.size} voxels of the reference are not finite, but each must be an attenuation in "
-            "1/mm; write 0 in places without material, and interpolate in places with material"
+            f"{n_not_finite} of {voxels.size} voxels of the reference are not finite, but each must be an attenuation "
+            "in 1/mm; write 0 in places without material, and interpolate in places with material"
         )
 
 
@@ -185,29 +188,31 @@ def placed(reference: Volume, grid: Grid, margin: int) -> tuple[F32, tuple[int, 
     Raises:
         ValueError: the reference and the grid have no place in common.
     """
-    given = reference.grid
+    reference_grid = reference.grid
     size, edge, start = np.array(grid.shape), np.array(grid.spacing), np.array(grid.first)
-    own, own_start = np.array(given.spacing), np.array(given.first)
+    own, own_start = np.array(reference_grid.spacing), np.array(reference_grid.first)
     low = np.maximum(np.ceil((own_start - start) / edge - 0.01), -margin).astype(int)
-    ends = (own_start + own * (np.array(given.shape) - 1) - start) / edge
-    high = np.minimum(np.floor(ends + 0.01), size - 1 + margin).astype(int)
+    last_index = (own_start + own * (np.array(reference_grid.shape) - 1) - start) / edge
+    high = np.minimum(np.floor(last_index + 0.01), size - 1 + margin).astype(int)
     if (high < low).any():
         raise ValueError(
-            f"the reference, {given}, and the volume to reconstruct, {grid}, do not overlap; give a volume of "
+            f"the reference, {reference_grid}, and the volume to reconstruct, {grid}, do not overlap; give a volume of "
             "the same sample in the same frame"
         )
     ratio, offset = edge / own, (start + low * edge - own_start) / own
     last = np.ceil(offset + ratio * (high - low)).astype(int) + 2
-    before = np.maximum(np.floor(offset).astype(int) - 1, 0)
-    data = np.asarray(reference.data[before[0] : last[0]], np.float32)[:, before[1] : last[1], before[2] : last[2]]
-    offset = offset - before
+    first_read = np.maximum(np.floor(offset).astype(int) - 1, 0)
+    data = np.asarray(reference.data[first_read[0] : last[0]], np.float32)[
+        :, first_read[1] : last[1], first_read[2] : last[2]
+    ]
+    offset = offset - first_read
     if np.allclose(ratio, 1, atol=1e-6) and np.allclose(offset, np.rint(offset), atol=0.01):
         first = np.rint(offset).astype(int)
         part = data[tuple(slice(f, f + n) for f, n in zip(first, high - low + 1, strict=True))]
     else:
         if ratio.max() > _COARSER:  # coarser voxels are means; a window of even size begins half a voxel early
-            wide = np.maximum(np.rint(ratio), 1).astype(int)
-            data, offset = ndi.uniform_filter(data, wide, mode="nearest"), offset + (wide % 2 == 0) / 2
+            window = np.maximum(np.rint(ratio), 1).astype(int)
+            data, offset = ndi.uniform_filter(data, window, mode="nearest"), offset + (window % 2 == 0) / 2
         part = ndi.affine_transform(data, ratio, offset, tuple(high - low + 1), order=1, mode="nearest")
     z, y, x = (-low).tolist()
     return np.ascontiguousarray(part.transpose(1, 2, 0)), (y, x, z)

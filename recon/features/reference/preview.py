@@ -53,11 +53,11 @@ class _Leaves:
         if moved is None:
             return x
         grid, width = problem.projector.grid, width_of(problem)
-        whole, affine = _rest(problem, x)[0], Basis.affine(grid, width)
-        moved = replace(moved, u=padded(affine.field(roughly_moved(moved, whole, grid, width))))
-        beside = np.where(moved.known(), 0, whole).astype(np.float32)
-        moved = affinely_moved(MotionViews.of(problem), moved, affine, beside)
-        fit = StateFit(problem, moved, whole, 1.0, width)
+        start, affine = _rest(problem, x)[0], Basis.affine(grid, width)
+        moved = replace(moved, u=padded(affine.field(roughly_moved(moved, start, grid, width))))
+        additional = np.where(moved.known(), 0, start).astype(np.float32)
+        moved = affinely_moved(MotionViews.of(problem), moved, affine, additional)
+        fit = StateFit(problem, moved, start, 1.0, width)
         for steps in PLAN:
             fit.x = fit.m + _rest(problem, fit.m)[0]
             fit.follow(steps)

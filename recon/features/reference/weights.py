@@ -14,7 +14,7 @@ from recon.features.reference.motion import Moved
 from recon.kernels.cpu.stencils import weighted_sum
 from recon.voxels.voxel_problem import VoxelProblem
 
-_FLOOR = 0.1  # slope of the change, in particle levels per voxel, at which the weight is half
+_HALF_WEIGHT_SLOPE = 0.1  # slope of the change, in particle levels per voxel, at which the weight is half
 ALL_LINES, CLEAR_LINES = 1.5, 3.0
 """Standard deviations of the noise from which on a voxel of a dark line counts: for a volume that ends on half voxels,
 and for other volumes and the trials that choose the weight.
@@ -22,14 +22,16 @@ and for other volumes and the trials that choose the weight.
 With `ALL_LINES`, trials choose a weight up to 1.8 times as large, because noise that looks like a line then has a small
 weight. Such volumes show cracks with 0.72 of their depth instead of 0.78 (30 projections of 160 columns, 10⁴ photons).
 """
-_SURE = 3.5  # standard deviations that the darkest voxel of a line must reach
+_SEED_DEVIATIONS = 3.5  # standard deviations that the darkest voxel of a line must reach
 _STEP = 0.7  # standard deviations above the first ones that lower the weight by one more unit
-_MOST = 4.0  # largest reduction by a line
+_LARGEST_REDUCTION = 4.0  # largest reduction by a line
 # length of a line in voxels; distance in voxels from the line to its sides; number of directions
 _LENGTH, _BESIDE, _TURNS = 9, 2.5, 12
 
 
-def falling(problem: VoxelProblem, moved: Moved, x: F32, m: F32, lines_from: float = ALL_LINES) -> tuple[F32, F32]:
+def falling(
+    problem: VoxelProblem, moved: Moved, x: F32, reference: F32, lines_from: float = ALL_LINES
+) -> tuple[F32, F32]:
     """Factors [y, x, z] on the weight of x, and on the weight of the change x - m.
 
     Args:
@@ -38,34 +40,36 @@ def falling(problem: VoxelProblem, moved: Moved, x: F32, m: F32, lines_from: flo
     square = np.zeros_like(x)
     for axis in range(3):
         low = tuple(slice(None, -1) if e == axis else slice(None) for e in range(3))
-        square[low] += np.square(np.diff(x - m, axis=axis))
-    steep = ndi.gaussian_filter(np.sqrt(square), 0.5) / np.float32(_FLOOR * moved.particles.level)
-    if not m.any():
-        return np.ones_like(x), 1 / (1 + steep)
-    dark = whole_lines(dark_lines(problem, moved, x, m), lines_from)
+        square[low] += np.square(np.diff(x - reference, axis=axis))
+    slope = ndi.gaussian_filter(np.sqrt(square), 0.5) / np.float32(_HALF_WEIGHT_SLOPE * moved.particles.level)
+    if not reference.any():
+        return np.ones_like(x), 1 / (1 + slope)
+    dark = whole_lines(dark_lines(problem, moved, x, reference), lines_from)
     lines = ndi.maximum_filter(np.maximum(dark - np.float32(lines_from), 0) / np.float32(_STEP), (3, 3, 1))
-    return 1 / (1 + np.minimum(lines, 1)), 1 / (1 + steep + np.minimum(lines, np.float32(_MOST)))
+    return 1 / (1 + np.minimum(lines, 1)), 1 / (1 + slope + np.minimum(lines, np.float32(_LARGEST_REDUCTION)))
 
 
-def dark_lines(problem: VoxelProblem, moved: Moved, x: F32, m: F32) -> F32:
+def dark_lines(problem: VoxelProblem, moved: Moved, x: F32, reference: F32) -> F32:
     """How much a line of voxels inside a particle is darker than both of its sides, in standard deviations of the
     noise.
 
     Lines are searched for in the change x - m plus the filtered back-projection of the residual. The value is 0 outside
     particles.
     """
-    own = moved.particles
+    particles = moved.particles
     residual = problem.views - problem.projector.forward_lines(x)
-    d, missing = x - m, replace(problem, data=residual, measured=None).filtered("hann")
-    if missing is not None:
-        d = d + missing
-    d = ndi.uniform_filter1d(d, min(3, d.shape[2]), axis=2, mode="nearest")
-    solid = m > 0.5 * own.level + own.base
-    inner, best, contrast = ndi.binary_erosion(solid, np.ones((3, 3, 1))), np.zeros_like(d), np.empty_like(d)
+    darkness, back_projected = x - reference, replace(problem, data=residual, measured=None).filtered("hann")
+    if back_projected is not None:
+        darkness = darkness + back_projected
+    darkness = ndi.uniform_filter1d(darkness, min(3, darkness.shape[2]), axis=2, mode="nearest")
+    solid = reference > 0.5 * particles.level + particles.base
+    inner = ndi.binary_erosion(solid, np.ones((3, 3, 1)))
+    best = np.zeros_like(darkness)
+    contrast = np.empty_like(darkness)
     if not inner.any():
         return best
-    for turn in np.arange(_TURNS) * np.pi / _TURNS:
-        weighted_sum(d, line_contrast(turn), contrast)
+    for angle in np.arange(_TURNS) * np.pi / _TURNS:
+        weighted_sum(darkness, line_contrast(angle), contrast)
         noise = 1.4826 * float(np.median(np.abs(contrast[inner])))
         np.maximum(best, contrast / np.float32(max(noise, 1e-30)), out=best)
     return np.where(solid, best, np.float32(0))
@@ -74,20 +78,23 @@ def dark_lines(problem: VoxelProblem, moved: Moved, x: F32, m: F32) -> F32:
 def whole_lines(dark: F32, lines_from: float) -> F32:
     """`dark` [y, x, z] for the voxels of lines that are surely there; 0 elsewhere.
 
-    Voxels above `lines_from` that touch each other are one line. A line is sure if its darkest voxel reaches `_SURE`;
-    then its faint parts count, too. (Two thresholds: Canny 1986, IEEE Trans. Pattern Anal. Mach. Intell. 8, 679.)
+    Voxels above `lines_from` that touch each other are one line. A line is sure if its darkest voxel reaches
+    `_SEED_DEVIATIONS`; then its faint parts count, too. (Two thresholds: Canny 1986, IEEE Trans. Pattern Anal. Mach.
+    Intell. 8, 679.)
     """
-    sure = ndi.binary_propagation(dark >= _SURE, np.ones((3, 3, 3)), dark > lines_from)
-    return np.where(sure, dark, np.float32(0))
+    is_line = ndi.binary_propagation(dark >= _SEED_DEVIATIONS, np.ones((3, 3, 3)), dark > lines_from)
+    return np.where(is_line, dark, np.float32(0))
 
 
-def line_contrast(turn: float) -> F32:
+def line_contrast(angle: float) -> F32:
     """The stencil for the mean of both sides of a line minus the mean of the line, in a direction (radians from x
     towards y).
     """
-    half = int(_LENGTH / 2 + _BESIDE) + 1
-    j, i = np.mgrid[-half : half + 1, -half : half + 1]
-    along, across = i * np.cos(turn) + j * np.sin(turn), np.abs(j * np.cos(turn) - i * np.sin(turn))
-    on = np.clip(_LENGTH / 2 + 0.5 - np.abs(along), 0, 1)
-    line, side = on * np.clip(1 - across, 0, 1), on * np.clip(1 - np.abs(across - _BESIDE), 0, 1)
+    half_side = int(_LENGTH / 2 + _BESIDE) + 1
+    j, i = np.mgrid[-half_side : half_side + 1, -half_side : half_side + 1]
+    distance_along = i * np.cos(angle) + j * np.sin(angle)
+    distance_across = np.abs(j * np.cos(angle) - i * np.sin(angle))
+    share_on_line = np.clip(_LENGTH / 2 + 0.5 - np.abs(distance_along), 0, 1)
+    line = share_on_line * np.clip(1 - distance_across, 0, 1)
+    side = share_on_line * np.clip(1 - np.abs(distance_across - _BESIDE), 0, 1)
     return np.asarray(side / side.sum() - line / line.sum(), np.float32)

@@ -28,20 +28,21 @@ if TYPE_CHECKING:
 
 _TUBE = re.compile(r"(\d+(?:\.\d+)?)kV((?:,\w+=\d+(?:\.\d+)?)*)")
 _COLS, _VIEWS = 160, 180  # enough projections for a curve with three parameters
-_ROUNDS, _SETTLED = 12, 0.01
-_LEAST_SEEN = 0.01  # relative increase of the largest line integral, from which on there is hardening
+_ROUNDS, _CONVERGED_CHANGE = 12, 0.01
+_LEAST_INCREASE = 0.01  # relative increase of the largest line integral, from which on there is hardening
 # number of projections, and of binned rows, in which hardening is searched for if the user did not ask for it
-_FEWEST, _BUSIEST = 30, 8
+_LEAST_VIEWS, _BUSIEST_ROWS = 30, 8
 # Hardening is reported without a request if two conditions are met: the correction halves the spread of the total
 # absorption (a quarter of the variance; with 30 projections this is not chance, F test 1e-4), and it changes densities
 # by this share.
-_EVENED, _MATTERS = 0.5, 0.05
+_LARGEST_VARIATION_RATIO, _LEAST_DENSITY_CHANGE = 0.5, 0.05
 # factor by which the total absorption may vary more afterwards, because the correction also amplifies noise
-_AS_EVEN = 1e-3
-_CURVED = 16  # number of float32 copies of a projection while a curve corrects it
-_RAYS, _VOLUMES = 10, 3  # number of float32 copies of the projections and of the volume during the fit of a curve
-_NODE = 40_000  # bytes of a curve per energy
-_RIM = 2.0  # voxels: shorter paths through the material are mostly its blurred edges
+_VARIATION_TOLERANCE = 1e-3
+_CURVE_COPIES = 16  # number of float32 copies of a projection while a curve corrects it
+# number of float32 copies of the projections and of the volume during the fit of a curve
+_RAY_COPIES, _VOLUME_COPIES = 10, 3
+_NODE_BYTES = 40_000  # bytes of a curve per energy
+_SHORTEST_PATH = 2.0  # voxels: shorter paths through the material are mostly its blurred edges
 
 
 def _model(text: str) -> str | None:
@@ -101,7 +102,7 @@ class Hardening:
         self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
     ) -> StepDone:
         if self.model is None:
-            return StepDone(_clearly_seen(views), {"hardening": "not corrected"})
+            return StepDone(_hardening_advice(views), {"hardening": "not corrected"})
         curve, sentence = curve_of(views.seen.data, views.geometry, self)
         if curve is not None:
             curve.linearise(views.lines.data, views.lines.weights)
@@ -148,7 +149,7 @@ def curve_of(views: F32, geometry: Geometry, step: Hardening) -> tuple[Curve | N
 
     highest = max(float(view.max()) for view in views)
     if step.spectrum is not None:
-        curve, how = curve_of_spectrum(*step.spectrum, highest), f"of {step.model}"
+        curve, origin_of_curve = curve_of_spectrum(*step.spectrum, highest), f"of {step.model}"
     else:
         try:
             curve, explained, _ = fit_curve(views, geometry)
@@ -156,12 +157,15 @@ def curve_of(views: F32, geometry: Geometry, step: Hardening) -> tuple[Curve | N
             return None, (
                 f"Beam hardening was not corrected, because the projections do not determine the curve ({error})."
             )
-        how = f"fitted to the projections; a sample of one material explains {explained:.1%} of their values"
+        origin_of_curve = (
+            f"fitted to the projections; a sample of one material explains {explained:.1%} of their values"
+        )
     corrected = float(np.interp(highest, curve.measured, curve.corrected))
-    if corrected < (1 + _LEAST_SEEN) * highest:
-        return None, f"Beam hardening: none was found ({how}), so nothing was corrected."
+    if corrected < (1 + _LEAST_INCREASE) * highest:
+        return None, f"Beam hardening: none was found ({origin_of_curve}), so nothing was corrected."
     return curve, (
-        f"Beam hardening was corrected with the curve {how}: line integrals of {highest:.3g} became {corrected:.3g}."
+        f"Beam hardening was corrected with the curve {origin_of_curve}: line integrals of {highest:.3g} became "
+        f"{corrected:.3g}."
     )
 
 
@@ -169,37 +173,40 @@ def curve_memory(geometry: Geometry, step: Hardening) -> int:
     """Peak memory in bytes for finding the hardening curve of these projections and applying it."""
     from recon.voxels.fbp import fbp_memory
 
-    view = _CURVED * 4 * math.prod(geometry.detector_shape)
+    view = _CURVE_COPIES * 4 * math.prod(geometry.detector_shape)
     if step.spectrum is not None:
-        return max(view, _NODE * step.spectrum[0].size)
-    _, _, small = _small(geometry)
-    grid, rays = Grid.matching(small), small.n_views * math.prod(small.detector_shape)
-    return max(view, 4 * (_RAYS * rays + _VOLUMES * math.prod(grid.shape)) + fbp_memory(small.n_views, grid.shape[2]))
+        return max(view, _NODE_BYTES * step.spectrum[0].size)
+    _, _, reduced = _reduced(geometry)
+    grid, rays = Grid.matching(reduced), reduced.n_views * math.prod(reduced.detector_shape)
+    return max(
+        view,
+        4 * (_RAY_COPIES * rays + _VOLUME_COPIES * math.prod(grid.shape)) + fbp_memory(reduced.n_views, grid.shape[2]),
+    )
 
 
-def _clearly_seen(views: PreparedProjections) -> str:
+def _hardening_advice(views: PreparedProjections) -> str:
     """A sentence if the rows with the most material show hardening although nobody asked for a correction; else ""."""
     from recon.voxels.beyond_field import reach_of
     from recon.voxels.field_edges import busiest_rows
 
     data, geometry = (ordinary := views.centred).seen.data, ordinary.geometry
-    plain = geometry.is_straight and not geometry.is_cone and not geometry.shifts.any()
-    plain = plain and views.sources.measured is None
-    if not plain or geometry.n_views < _FEWEST or reach_of(ordinary.seen).beyond:
+    is_supported = geometry.is_straight and not geometry.is_cone and not geometry.shifts.any()
+    is_supported = is_supported and views.sources.measured is None
+    if not is_supported or geometry.n_views < _LEAST_VIEWS or reach_of(ordinary.seen).beyond:
         return ""
-    rows = busiest_rows(data, _BUSIEST * _small(geometry)[1])
-    if not data[:, rows].mean() > 0 or _unevenness(data[:, rows]) < _AS_EVEN:
+    rows = busiest_rows(data, _BUSIEST_ROWS * _reduced(geometry)[1])
+    if not data[:, rows].mean() > 0 or _unevenness(data[:, rows]) < _VARIATION_TOLERANCE:
         return ""
     from recon.features.beam_hardening import NoCurveError  # imported here, because it loads scipy.optimize
 
     try:
-        curve, _, evened = fit_curve(data[:, rows], geometry.rows(rows.start, rows.stop))
+        curve, _, variation_ratio = fit_curve(data[:, rows], geometry.rows(rows.start, rows.stop))
     except (NoCurveError, ValueError):
         return ""
     corrected = float(np.interp(highest := float(data[:, rows].max()), curve.measured, curve.corrected))
-    if evened > _EVENED or corrected < (1 + _MATTERS) * highest:
+    if variation_ratio > _LARGEST_VARIATION_RATIO or corrected < (1 + _LEAST_DENSITY_CHANGE) * highest:
         return ""
-    factor = 1 / evened
+    factor = 1 / variation_ratio
     return (
         "If the sample is of one material, give --hardening fit, because the projections show beam hardening. The "
         f"correction for one material would raise line integrals of {highest:.3g} to {corrected:.3g}. The correction "
@@ -238,32 +245,33 @@ def fit_curve(views: F32, geometry: Geometry) -> tuple[Curve, float, float]:
             "--hardening fit needs a parallel beam, because only in a parallel beam the total absorption is the "
             "same in all projections. Give --hardening MATERIAL:BEAM instead"
         )
-    view_numbers, factor, small = _small(geometry)
+    view_numbers, factor, reduced = _reduced(geometry)
     measured = np.concatenate([bin_views(views[view : view + 1], factor) for view in view_numbers])
-    grid, highest, now, before = Grid.matching(small), max(float(view.max()) for view in views), measured, math.inf
+    grid, highest = Grid.matching(reduced), max(float(view.max()) for view in views)
+    linearised, last_corrected = measured, math.inf
     for _ in range(_ROUNDS):
-        volume = direct(now, small, grid, "hann")
+        volume = direct(linearised, reduced, grid, "hann")
         air, material = k_means(volume, 2)
-        paths = project(Volume((volume > (air + material) / 2).astype(np.float32), grid), small)
-        clear = (paths == 0) | (paths > _RIM * grid.voxel_size)
-        curve, explained = curve_of_paths(measured[clear], paths[clear], highest)
+        paths = project(Volume((volume > (air + material) / 2).astype(np.float32), grid), reduced)
+        usable = (paths == 0) | (paths > _SHORTEST_PATH * grid.voxel_size)
+        curve, explained = curve_of_paths(measured[usable], paths[usable], highest)
         corrected = float(np.interp(highest, curve.measured, curve.corrected))
-        settled = abs(corrected - before) < _SETTLED * corrected
-        before, now = corrected, measured.copy()
-        curve.linearise(now)
-        if settled:
-            uneven, after = _unevenness(measured), _unevenness(now)
-            if after > uneven + _AS_EVEN:
+        converged = abs(corrected - last_corrected) < _CONVERGED_CHANGE * corrected
+        last_corrected, linearised = corrected, measured.copy()
+        curve.linearise(linearised)
+        if converged:
+            uneven_before, uneven_after = _unevenness(measured), _unevenness(linearised)
+            if uneven_after > uneven_before + _VARIATION_TOLERANCE:
                 raise NoCurveError(
                     "after the correction the projections agree less with each other: their total "
-                    f"absorption varies by {after:.2%} instead of {uneven:.2%}, for example because the "
+                    f"absorption varies by {uneven_after:.2%} instead of {uneven_before:.2%}, for example because the "
                     "sample is denser outside"
                 )
-            return curve, explained, after / max(uneven, 1e-30)
+            return curve, explained, uneven_after / max(uneven_before, 1e-30)
     raise NoCurveError(f"the fit of the curve did not converge in {_ROUNDS} iterations")
 
 
-def _small(geometry: Geometry) -> tuple[NDArray[np.int64], int, Geometry]:
+def _reduced(geometry: Geometry) -> tuple[NDArray[np.int64], int, Geometry]:
     """Projections and a binning that are enough for a curve, and their geometry."""
     n, (rows, cols) = geometry.n_views, geometry.detector_shape
     view_numbers = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).astype(int))
@@ -273,7 +281,7 @@ def _small(geometry: Geometry) -> tuple[NDArray[np.int64], int, Geometry]:
 
 def _unevenness(views: F32) -> float:
     """Relative variation of the total absorption of a row between projections; median over the rows with material."""
-    mass = views.sum(axis=2, dtype=np.float64)
-    mean = mass.mean(axis=0)
-    filled = mean > 0.1 * mean.max()
-    return float(np.median(mass.std(axis=0)[filled] / mean[filled]))
+    absorption = views.sum(axis=2, dtype=np.float64)
+    mean_absorption = absorption.mean(axis=0)
+    has_material = mean_absorption > 0.1 * mean_absorption.max()
+    return float(np.median(absorption.std(axis=0)[has_material] / mean_absorption[has_material]))

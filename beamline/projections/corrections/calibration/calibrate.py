@@ -37,10 +37,10 @@ def _terms(text: str) -> tuple[str, ...]:
     names = [name.strip() for name in text.split(",")]
     if names == ["none"]:
         return ()
-    every = *GEOMETRY, GAINS
-    if others := [name for name in names if name not in every]:
-        raise ValueError(unknown("term", others[0], every))
-    return tuple(name for name in every if name in names)
+    all_terms = *GEOMETRY, GAINS
+    if others := [name for name in names if name not in all_terms]:
+        raise ValueError(unknown("term", others[0], all_terms))
+    return tuple(name for name in all_terms if name in names)
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,8 @@ class Calibrate:
             return StepMemory()
         from recon.features.calibration.gains import gains_memory
 
-        gains = gains_memory(part.geometry) if GAINS in self.terms else 0
-        return StepMemory(alone=max(_search_memory(part, self.geometry), gains))
+        gains_bytes = gains_memory(part.geometry) if GAINS in self.terms else 0
+        return StepMemory(alone=max(_search_memory(part, self.geometry), gains_bytes))
 
     def refuse_few(self, used: int, usable: int, cols: int) -> None:
         """Raise DataError for terms that need more projections, or more binned columns, than the scan has."""

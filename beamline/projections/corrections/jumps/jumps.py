@@ -107,11 +107,11 @@ def find_jumps(
     if not jumps.size:
         return SampleJumps(frames)
     if scan.selection.cone is not None:
-        where = frames_text(jumps)
+        jump_text = frames_text(jumps)
         return SampleJumps(
             frames,
             "Use --views to choose the projections before or after the jump: the monitor reports that "
-            f"the sample jumped at {where}. In a cone beam jumps cannot be checked, so all projections "
+            f"the sample jumped at {jump_text}. In a cone beam jumps cannot be checked, so all projections "
             "are used as if the sample had not moved.",
         )
     runs, n_most = [frames], jumps.size * (jumps.size + 1) // 2
@@ -209,6 +209,6 @@ def _search_memory(scan: SelectedScan) -> int:
     n = min(source.table.views.size, _VIEWS + 2 * _SHORT)
     band = _band(scan)
     views = band.selection.geometry((source.shape[1] - 1) / 2, np.linspace(0, math.pi, n, endpoint=False))
-    copy = 4 * n * math.prod(views.detector_shape)
-    work = OsSirtTv(iterations=SWEEPS).memory(views, Grid.matching(views), weighted=True)
-    return copy + max(at_once_memory(band, n), work)
+    copy_bytes = 4 * n * math.prod(views.detector_shape)
+    solver_bytes = OsSirtTv(iterations=SWEEPS).memory(views, Grid.matching(views), weighted=True)
+    return copy_bytes + max(at_once_memory(band, n), solver_bytes)

@@ -29,8 +29,8 @@ _NO_FILTER = (
 
 def _material(text: str) -> str | None:
     """Parse the option: the part after `paganin:`, or "auto"; None for "none"."""
-    way, _, material = text.partition(":")
-    if text not in ("none", _AUTO) and (way != "paganin" or not material):
+    filter_name, _, material = text.partition(":")
+    if text not in ("none", _AUTO) and (filter_name != "paganin" or not material):
         raise ValueError(f"{text!r} is unknown; expected auto, none, paganin:RATIO (delta/beta) or paganin:MATERIAL")
     return _AUTO if text == _AUTO else material or None
 
@@ -147,28 +147,28 @@ class Phase:
         filter = length_by_held_out_views(views.data, geometry, floor, ~views.masked)
         if filter is None:
             return replace(self, explanation=f"{overshoot.in_words()} {_NO_FILTER}")
-        if filter.gain < LEAST_DROP:
-            why = (
+        if filter.residual_drop < LEAST_DROP:
+            reason = (
                 f"No phase filter was applied. A filter over {filter.length:.3g} pixels would lower the residual "
-                f"in held-out projections by {filter.gain:.0%}. Because a filter blurs cracks, it is applied by "
-                f"default only if it lowers this residual by at least {LEAST_DROP:.0%}. To apply a filter, give "
+                f"in held-out projections by {filter.residual_drop:.0%}. Because a filter blurs cracks, it is applied "
+                f"by default only if it lowers this residual by at least {LEAST_DROP:.0%}. To apply a filter, give "
                 "--phase paganin:RATIO."
             )
-            return replace(self, explanation=f"{overshoot.in_words()} {why}")
+            return replace(self, explanation=f"{overshoot.in_words()} {reason}")
         relative_error = filter.factor - 1
-        why = (
+        reason = (
             "A phase filter was applied, because it lowers the residual in held-out projections by "
-            f"{filter.gain:.0%}. The held-out projections determine the square of the filter's length to within "
-            f"{relative_error:.0%}. --phase none omits the filter."
+            f"{filter.residual_drop:.0%}. The held-out projections determine the square of the filter's length to "
+            f"within {relative_error:.0%}. --phase none omits the filter."
         )
-        return replace(self, length=filter.length, explanation=f"{overshoot.in_words()} {why}")
+        return replace(self, length=filter.length, explanation=f"{overshoot.in_words()} {reason}")
 
     def on(self, scan: SelectedScan) -> tuple[ViewFilter | None, StepDone]:
         if self.material is None or (self.material == _AUTO and self.length is None):
-            why = self.explanation or (
+            reason = self.explanation or (
                 self.unsharp and "--unsharp has no effect without a phase filter; give --phase paganin:RATIO."
             )
-            return None, StepDone(f"No phase retrieval. {why}" if why else "", {"phase": "not retrieved"})
+            return None, StepDone(f"No phase retrieval. {reason}" if reason else "", {"phase": "not retrieved"})
         paganin, sentence = self.filter_of(scan)
 
         def apply(views: Projections, first: int) -> Projections:
@@ -193,7 +193,7 @@ class Phase:
         energy = source.energy_kev if self.energy_kev is None else self.energy_kev
         distance = self.distance_mm
         if distance is None:
-            distance = _stated(source) if cone is None else cone[1] - cone[0] or None
+            distance = _stated_distance(source) if cone is None else cone[1] - cone[0] or None
         values = {"--distance-mm": distance, "--energy-kev": energy, "--pixel-size-um": pitch}
         missing = [option for option, value in values.items() if value is None]
         if missing and self.length is None:
@@ -202,8 +202,10 @@ class Phase:
         length, sentence = self.length or 0.0, "from held-out projections"
         if not missing:
             assert distance is not None and energy is not None and pitch is not None
-            near, scale = (1.0, 1.0) if cone is None else (cone[0] / (cone[0] + distance), cone[0] / cone[1])
-            unit = length_of(1.0, distance * near, energy, pitch * scale * selection.binning)
+            fresnel_factor, pitch_factor = (
+                (1.0, 1.0) if cone is None else (cone[0] / (cone[0] + distance), cone[0] / cone[1])
+            )
+            unit = length_of(1.0, distance * fresnel_factor, energy, pitch * pitch_factor * selection.binning)
             try:
                 ratio = self.delta_beta(energy) if self.length is None else (self.length / unit) ** 2
             except ValueError as error:
@@ -227,7 +229,7 @@ class Phase:
         return paganin, f"{sentence} {self.explanation}".rstrip()
 
 
-def _stated(source: ScanSource) -> float | None:
+def _stated_distance(source: ScanSource) -> float | None:
     """mm from the sample to the detector according to the file. 0 counts as unknown, because programs write 0 if nobody
     measured the distance.
     """

@@ -11,7 +11,7 @@ import pytest
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.features.joint.proportions import _IN_TIME, Proportions, smoothness
+from recon.features.joint.proportions import _TIME_WEIGHT, Proportions, smoothness
 from recon.voxels.projector import Projector
 
 SIDE, ROWS, KNOTS = 20, 3, 3
@@ -54,7 +54,7 @@ def test_rough_is_the_gradient_of_the_squares_of_differences(rng: np.random.Gene
     at, along = rng.standard_normal((2, *changing().shape))
 
     def half_squares(factors: F64) -> float:
-        pairs = _IN_TIME * float((matter**2 * np.diff(factors, axis=0) ** 2).sum())
+        pairs = _TIME_WEIGHT * float((matter**2 * np.diff(factors, axis=0) ** 2).sum())
         for axis in range(3):
             first, second = np.delete(matter, -1, axis), np.delete(matter, 0, axis)
             pairs += float((first * second * np.diff(factors, axis=axis + 1) ** 2).sum())

@@ -48,7 +48,7 @@ TRUTH = ParticleEstimate(np.array([0.9, 1.0, 1.05]), np.array([1.03, 0.98, 1.0])
 def volume_of(estimate: ParticleEstimate) -> np.ndarray:
     volume = np.zeros((N, N, NZ), np.float32)
     for k, each in enumerate(BODIES):
-        patch = patch_of(each, 1.0, estimate.scale[k], estimate.place[k], estimate.turn, volume.shape)
+        patch = patch_of(each, 1.0, estimate.scale[k], estimate.position[k], estimate.rotation, volume.shape)
         assert patch is not None
         volume[patch.box] += np.float32(estimate.gain[k]) * patch.columns[0]
     return volume
@@ -124,7 +124,7 @@ def test_rounds_find_gain_scale_and_place() -> None:
     found = improved_rounds(views_of(lines), BODIES, start, (20, 20, 20, 20))
     np.testing.assert_allclose(found.gain, TRUTH.gain, atol=5e-3)
     np.testing.assert_allclose(found.scale, TRUTH.scale, atol=2e-3)
-    np.testing.assert_allclose(found.place, TRUTH.place, atol=0.02)
+    np.testing.assert_allclose(found.position, TRUTH.position, atol=0.02)
 
 
 def test_deviations_from_halves_are_those_of_least_squares(rng: np.random.Generator) -> None:
