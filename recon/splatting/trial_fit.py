@@ -46,7 +46,7 @@ def predict(method: Fit, trial: Trial, so_far: TrialChoice, prior: Prior) -> Pre
     """
     begin = trial.settings.now()
     tried = _Fit.of(method, trial, FIRST_SHARE)
-    smooth, best = trial.smooth_residuals, so_far.least
+    smooth, best = trial.smooth_residuals, so_far.best_residuals
     residuals, remark = tried.refined(prior), ""
     leads = best is None or significantly_better(trial.in_line_integrals(residuals), best, so_far.least_gain)
     if so_far.least_gain > 0 and not leads and significantly_better(smooth, residuals, FAR_BEHIND):

@@ -70,8 +70,8 @@ def run_on_extended_grid(method: Method, problem: ReconProblem, control: RunCont
     if box == grid:
         return method.run(problem, control)
     result = method.run(replace(problem, grid=box), control)
-    before = np.rint(np.subtract(grid.first, box.first) / grid.spacing).astype(int)
-    field = tuple(slice(first, first + n) for first, n in zip(before, grid.shape, strict=True))
+    margin_before = np.rint(np.subtract(grid.first, box.first) / grid.spacing).astype(int)
+    field = tuple(slice(first, first + n) for first, n in zip(margin_before, grid.shape, strict=True))
     whole = result.volume.data
     radius = {} if reach.sample is None else reach.sample.settings
     volume = Volume(np.ascontiguousarray(whole[field]), grid)
@@ -149,15 +149,15 @@ def _radius_of(views: Views) -> SampleRadius | None:
         views: only some rows of some projections are read; rays of weight 0 do not count.
     """
     geometry = views.geometry
-    own, reach = geometry.is_centred, geometry.reach
-    used = np.flatnonzero(own)
-    sampled_views = np.union1d(spread_views(geometry.angles[used], _VIEWS, used), np.flatnonzero(~own))
+    is_centred, reach = geometry.is_centred, geometry.reach
+    used = np.flatnonzero(is_centred)
+    sampled_views = np.union1d(spread_views(geometry.angles[used], _VIEWS, used), np.flatnonzero(~is_centred))
     if (measured := _some_rows(views, sampled_views)) is None or not edges_of(measured).beyond(0.0):
         return None
     ordinary = measured.select(np.flatnonzero(measured.geometry.is_centred))
     if ordinary.geometry.n_views < LEAST_VIEWS:
-        ends = sample_reach(ordinary.data.mean(axis=0), geometry.axis_col) * geometry.sample_pitch
-        return SampleRadius(float(np.clip(np.median(ends), reach, _WIDEST * reach)), reach, _WIDEST * reach, 1.0)
+        sample_ends = sample_reach(ordinary.data.mean(axis=0), geometry.axis_col) * geometry.sample_pitch
+        return SampleRadius(float(np.clip(np.median(sample_ends), reach, _WIDEST * reach)), reach, _WIDEST * reach, 1.0)
     return _predicting_radius(measured, reach)
 
 
@@ -195,36 +195,38 @@ def _given_radius(sample_radius: float | SampleRadius, reach: float) -> SampleRa
 def _predicting_radius(views: Views, reach: float) -> SampleRadius | None:
     """The radius whose volume predicts the held-out projections best; `reach`: half width of the whole detector."""
     trial = _Trial.of(views, _COLS)
-    tried: dict[float, tuple[F64, float]] = {}
+    trials: dict[float, tuple[F64, float]] = {}
 
     def best(ratios: Iterable[float]) -> float:
         for ratio in ratios:
-            if ratio not in tried:
-                tried[ratio] = trial.of_radius(ratio * reach)
-        return min(tried, key=lambda ratio: float(tried[ratio][0].mean()))
+            if ratio not in trials:
+                trials[ratio] = trial.of_radius(ratio * reach)
+        return min(trials, key=lambda ratio: float(trials[ratio][0].mean()))
 
     first = best(_STEP**k for k in range(1 + math.floor(math.log(_WIDEST, _STEP))))
-    least = best(first * _FINE**k for k in (-3, -2, -1, 1, 2, 3) if first * _FINE**k >= 1)
-    if least < _STEP:  # coarse voxels blur the edge of the field of view
+    best_ratio = best(first * _FINE**k for k in (-3, -2, -1, 1, 2, 3) if first * _FINE**k >= 1)
+    if best_ratio < _STEP:  # coarse voxels blur the edge of the field of view
         trial = _Trial.of(views, 2 * _COLS)
-        tried.clear()
-        least = best(_FINE ** (k / 2) for k in range(8))
-    if predicts_as_well(tried[1.0][0], tried[least][0]):
+        trials.clear()
+        best_ratio = best(_FINE ** (k / 2) for k in range(8))
+    if predicts_as_well(trials[1.0][0], trials[best_ratio][0]):
         return None
     cylinder = _cylinder(trial)
-    fits = cylinder is not None and reach < cylinder[0] <= _WIDEST * reach
-    if cylinder is not None and fits and predicts_as_well(cylinder[1], tried[least][0]):
+    is_plausible = cylinder is not None and reach < cylinder[0] <= _WIDEST * reach
+    if cylinder is not None and is_plausible and predicts_as_well(cylinder[1], trials[best_ratio][0]):
         radius = cylinder[0] / reach
-        alike = [radius / _FINE, radius, radius * _FINE]
-        tried |= {ratio: trial.of_radius(ratio * reach) for ratio in alike}
-        least = radius
+        equal_ratios = [radius / _FINE, radius, radius * _FINE]
+        trials |= {ratio: trial.of_radius(ratio * reach) for ratio in equal_ratios}
+        best_ratio = radius
     else:
-        alike = [ratio for ratio, (residuals, _) in tried.items() if predicts_as_well(residuals, tried[least][0])]
-        radius = min(alike) * _FINE
-    alike += [ratio for ratio in tried if abs(math.log(ratio / radius, _FINE)) < 1.5]
-    densities = [tried[ratio][1] for ratio in alike]
-    uncertain = (max(densities) - min(densities)) / 2 / tried[least][1] if tried[least][1] > 0 else 1.0
-    return SampleRadius(radius * reach, min(alike) * reach, max(alike) * reach, uncertain)
+        equal_ratios = [
+            ratio for ratio, (residuals, _) in trials.items() if predicts_as_well(residuals, trials[best_ratio][0])
+        ]
+        radius = min(equal_ratios) * _FINE
+    equal_ratios += [ratio for ratio in trials if abs(math.log(ratio / radius, _FINE)) < 1.5]
+    densities = [trials[ratio][1] for ratio in equal_ratios]
+    relative_error = (max(densities) - min(densities)) / 2 / trials[best_ratio][1] if trials[best_ratio][1] > 0 else 1.0
+    return SampleRadius(radius * reach, min(equal_ratios) * reach, max(equal_ratios) * reach, relative_error)
 
 
 def _cylinder(trial: _Trial) -> tuple[float, F64] | None:
@@ -236,18 +238,18 @@ def _cylinder(trial: _Trial) -> tuple[float, F64] | None:
     """
 
     def terms(geometry: Geometry) -> F64:
-        cols, turn = geometry.detector_shape[1], geometry.angles[:, None]
+        cols, angles = geometry.detector_shape[1], geometry.angles[:, None]
         axis = geometry.axis_col + geometry.shifts[:, :1]
         u = (np.arange(cols) - axis) * geometry.sample_pitch
-        parts = (1.0, -(u**2), u * np.cos(turn), u * np.sin(turn), np.cos(2 * turn), np.sin(2 * turn))
+        parts = (1.0, -(u**2), u * np.cos(angles), u * np.sin(angles), np.cos(2 * angles), np.sin(2 * angles))
         return np.stack([np.broadcast_to(part, u.shape) for part in parts], axis=-1)
 
     seen, unseen = trial.seen, trial.unseen
     squares = np.square(seen.data.mean(axis=1, dtype=np.float64))
-    constant, bend, *beside, _, _ = fit = np.linalg.lstsq(terms(seen.geometry).reshape(-1, 6), squares.ravel())[0]
+    constant, bend, *offset_terms, _, _ = fit = np.linalg.lstsq(terms(seen.geometry).reshape(-1, 6), squares.ravel())[0]
     if bend <= 0:
         return None
-    squared_distance = float(np.square(beside).sum()) / (2 * bend) ** 2
+    squared_distance = float(np.square(offset_terms).sum()) / (2 * bend) ** 2
     squared_radius = constant / bend + squared_distance / 2
     if squared_radius <= 0:
         return None
@@ -265,15 +267,15 @@ def _factor(geometry: Geometry, columns: int) -> int:
 def _some_rows(whole: Views, sampled_views: NDArray[np.intp]) -> Views | None:
     """The measured projections, in the rows with the most material (cone: the middle rows); None: there are none."""
     geometry = whole.geometry.select(sampled_views)
-    look = np.nan_to_num(
+    sampled = np.nan_to_num(
         whole.data[sampled_views[:: max(1, len(sampled_views) // _LOOKS)]], nan=0.0, posinf=0.0, neginf=0.0
     )
     height = _ROWS * _factor(geometry, _COLS)
     rows = slice(0, geometry.detector_shape[0])
     if not geometry.is_cone:
-        rows = busiest_rows(look, height)
+        rows = busiest_rows(sampled, height)
         geometry = geometry.rows(rows.start, rows.stop)
-    elif (middle := middle_of_cone(geometry, Grid.matching(geometry), look, height)) is not None:
+    elif (middle := middle_of_cone(geometry, Grid.matching(geometry), sampled, height)) is not None:
         rows, geometry = middle[:2]
     views = np.stack([whole.data[view, rows] for view in sampled_views])
     known = np.isfinite(views)

@@ -37,17 +37,17 @@ MOST_TRIALS = (2 + _OCTAVES) / TRIALS
 """Largest number of iterations of all tests, divided by the usual number."""
 
 
-def exceeds_standard_error(gains: F64, errors: float) -> bool:
+def exceeds_standard_error(improvements: F64, errors: float) -> bool:
     """Whether the mean gain [held-out view] exceeds `errors` of its standard errors.
 
     False if a gain is not finite because a candidate was stopped or diverged.
     """
-    return bool(np.isfinite(gains).all()) and float(gains.mean()) > errors * _standard_error(gains)
+    return bool(np.isfinite(improvements).all()) and float(improvements.mean()) > errors * _standard_error(improvements)
 
 
-def _standard_error(gains: F64) -> float:
+def _standard_error(improvements: F64) -> float:
     """Standard error of the mean gain [held-out view]; 0 for a single projection."""
-    return float(gains.std(ddof=1)) / math.sqrt(gains.size) if gains.size > 1 else 0.0
+    return float(improvements.std(ddof=1)) / math.sqrt(improvements.size) if improvements.size > 1 else 0.0
 
 
 def predicts_as_well(residuals: F64, best: F64) -> bool:
@@ -93,28 +93,28 @@ class TrialChoice(NamedTuple):
     """Which of the candidates tried so far predicts held-out projections best.
 
     Attributes:
-        where: the part of the scan that was used; if no candidate was tried, the reason.
+        part_of_scan: the part of the scan that was used; if no candidate was tried, the reason.
         least_gain: see `LEAST_GAIN`.
         predictions: predictions of the candidates, the simplest first.
     """
 
-    where: str
+    part_of_scan: str
     least_gain: float = LEAST_GAIN
     predictions: tuple[Prediction, ...] = ()
 
     @classmethod
     def of(cls, values: Sequence[Any]) -> TrialChoice:
         """Convert a choice, or its values from a file (see `Decisions`), to a choice."""
-        where, least_gain, predictions = values
+        part_of_scan, least_gain, predictions = values
         named = ((name, residuals, prior and Prior.of(prior), remark) for name, residuals, prior, remark in predictions)
-        return cls(where, least_gain, tuple(Prediction(*each) for each in named))
+        return cls(part_of_scan, least_gain, tuple(Prediction(*each) for each in named))
 
     def after(self, prediction: Prediction) -> TrialChoice:
         """The choice with one more candidate."""
         return self._replace(predictions=(*self.predictions, prediction))
 
     @property
-    def tried(self) -> dict[int, F64]:
+    def residuals_by_number(self) -> dict[int, F64]:
         """Residuals [held-out view] of the candidates that were tried, by number.
 
         A candidate whose residual is not finite was stopped or diverged, and counts as not tried.
@@ -127,18 +127,18 @@ class TrialChoice(NamedTuple):
     @property
     def best(self) -> int | None:
         """Number of the candidate with the smallest mean residual; None: no candidate was tried."""
-        tried = self.tried
-        return min(tried, key=lambda number: float(tried[number].mean()), default=None)
+        residuals = self.residuals_by_number
+        return min(residuals, key=lambda number: float(residuals[number].mean()), default=None)
 
     @property
-    def least(self) -> F64 | None:
+    def best_residuals(self) -> F64 | None:
         """The residuals of the best candidate; None: no candidate was tried."""
-        return None if self.best is None else self.tried[self.best]
+        return None if self.best is None else self.residuals_by_number[self.best]
 
     @property
     def with_levels(self) -> int | None:
         """Number of the candidate whose discrete levels passed all their tests; None: there is none."""
-        return next((number for number in self.tried if self.predictions[number].has_levels), None)
+        return next((number for number in self.residuals_by_number if self.predictions[number].has_levels), None)
 
     @property
     def levels_suffice(self) -> bool:
@@ -146,10 +146,10 @@ class TrialChoice(NamedTuple):
 
         In this case costlier candidates are not tried, to save time: they do not use levels.
         """
-        tried, levels = self.tried, self.with_levels
+        residuals, levels = self.residuals_by_number, self.with_levels
         return levels is not None and all(
-            significantly_better(tried[levels], each, self.least_gain)
-            for number, each in tried.items()
+            significantly_better(residuals[levels], each, self.least_gain)
+            for number, each in residuals.items()
             if number < levels
         )
 
@@ -163,25 +163,27 @@ class TrialChoice(NamedTuple):
         smaller residual. (A shell from 30 projections with 500 photons: patches are 0.6 dB better than levels, which
         lower the residual by 1 %.)
         """
-        tried, levels = self.tried, self.with_levels
-        if not tried:
+        residuals, levels = self.residuals_by_number, self.with_levels
+        if not residuals:
             return None
         if levels is None or self.levels_suffice:
-            return _simplest_of(tried, self.least_gain)
-        others = {number: each for number, each in tried.items() if number != levels}
+            return _simplest_of(residuals, self.least_gain)
+        others = {number: each for number, each in residuals.items() if number != levels}
         other = _simplest_of(others, self.least_gain)
-        return levels if tried[levels].mean() < tried[other].mean() else other
+        return levels if residuals[levels].mean() < residuals[other].mean() else other
 
     @property
     def verdicts(self) -> list[str]:
         """For each candidate "best", or "alike" if it predicts equally well within chance, or "".
 
         All are empty if the best candidate does not lower any other residual by `least_gain`."""
-        tried, least, words = self.tried, self.least, [""] * len(self.predictions)
-        if least is None or all((1 - self.least_gain) * each.mean() <= least.mean() for each in tried.values()):
+        residuals, best_residuals, words = self.residuals_by_number, self.best_residuals, [""] * len(self.predictions)
+        if best_residuals is None or all(
+            (1 - self.least_gain) * each.mean() <= best_residuals.mean() for each in residuals.values()
+        ):
             return words
-        for number, each in tried.items():
-            words[number] = "best" if number == self.best else "alike" * predicts_as_well(each, least)
+        for number, each in residuals.items():
+            words[number] = "best" if number == self.best else "alike" * predicts_as_well(each, best_residuals)
         return words
 
     @property
@@ -197,11 +199,12 @@ class TrialChoice(NamedTuple):
         of the projections.
         """
         if self.chosen is None:
-            return self.where
+            return self.part_of_scan
         means = [(each.name, np.mean(each.residuals)) for each in self.predictions if each.residuals is not None]
         listed = [f"{name} {mean:#.4g}" for name, mean in means]
         remarks = [each.remark for each in self.predictions if each.remark]
-        return f"test reconstructions of {self.where}, {MEASURE}: {'; '.join([*listed, *remarks])}{self._of_the_best}"
+        sentences = "; ".join([*listed, *remarks])
+        return f"test reconstructions of {self.part_of_scan}, {MEASURE}: {sentences}{self._of_the_best}"
 
     @property
     def _of_the_best(self) -> str:
@@ -209,7 +212,7 @@ class TrialChoice(NamedTuple):
         if self.chosen is None or self.best is None or self.chosen == self.best:
             return ""
         (simple, of_simple), (best, of_best) = (
-            (self.predictions[number].name, self.tried[number]) for number in (self.chosen, self.best)
+            (self.predictions[number].name, self.residuals_by_number[number]) for number in (self.chosen, self.best)
         )
         improvement, error = (
             (of_simple - of_best).mean() / of_simple.mean(),
@@ -243,26 +246,28 @@ def preferred_strength(residuals_of: Callable[[float], F64], first: float) -> Be
     Returns:
         None if a residual is infinite, because the tests were stopped.
     """
-    tried: dict[int, F64] = {}
+    residuals: dict[int, F64] = {}
 
     def mean(octave: int) -> float:
-        if octave not in tried:
-            tried[octave] = residuals_of(first * 2.0**octave)
-        return float(tried[octave].mean())
+        if octave not in residuals:
+            residuals[octave] = residuals_of(first * 2.0**octave)
+        return float(residuals[octave].mean())
 
     if math.isinf(mean(1)) or math.isinf(mean(0)):
         return None
-    up = not exceeds_standard_error(tried[1] - tried[0], _ERRORS)
-    place, towards = (1, 1) if up else (0, -1)
-    while abs(place + towards) <= _OCTAVES:
-        if math.isinf(mean(place + towards)):
+    stronger_first = not exceeds_standard_error(residuals[1] - residuals[0], _ERRORS)
+    tested_octave, direction = (1, 1) if stronger_first else (0, -1)
+    while abs(tested_octave + direction) <= _OCTAVES:
+        if math.isinf(mean(tested_octave + direction)):
             return None
-        if exceeds_standard_error(tried[place + towards] - tried[place], _ERRORS if up else 0.0):
+        if exceeds_standard_error(
+            residuals[tested_octave + direction] - residuals[tested_octave], _ERRORS if stronger_first else 0.0
+        ):
             break
-        place += towards
-    octave = min(tried, key=mean)
+        tested_octave += direction
+    octave = min(residuals, key=mean)
     vertex = float(octave)
-    if octave - 1 in tried and octave + 1 in tried:
+    if octave - 1 in residuals and octave + 1 in residuals:
         weaker, stronger = mean(octave - 1) - mean(octave), mean(octave + 1) - mean(octave)
         vertex += (weaker - stronger) / (2 * (weaker + stronger)) if weaker + stronger > 0 else 0.0
-    return BestStrength(first * 2.0**vertex, tried[octave])
+    return BestStrength(first * 2.0**vertex, residuals[octave])

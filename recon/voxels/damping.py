@@ -29,11 +29,11 @@ from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import one_of_like_rows
 
 _CELLS = 64  # largest number of cells along the longer side; finer detail is not damped
-_UNDAMPED, _MOST = 2.0, 32.0  # cycles per side, above which steps are longer; the largest gain
+_UNDAMPED_CYCLES, _LARGEST_GAIN = 2.0, 32.0  # cycles per side, above which steps are longer; the largest gain
 _GAIN_A_VIEW = 2 / 3  # longer steps for detail that the projections do not resolve would only add noise
 _LEAST_OF_TENTS = 0.2  # smallest share of a wave that remains in the tents and is still compensated
 _LANCZOS_STEPS, _MARGIN = 8, 1.1  # safety factor, because Lanczos' estimate is too low
-_NOTHING = 1e-6  # size of the rounding error
+_ROUNDING_ERROR = 1e-6  # size of the rounding error
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Damping:
     @classmethod
     def of(cls, shape: tuple[int, int, int], n_views: int) -> Damping:
         """The damping for steps that use this number of projections."""
-        return cls(shape, min(max(_GAIN_A_VIEW * n_views, 1.0), _MOST))
+        return cls(shape, min(max(_GAIN_A_VIEW * n_views, 1.0), _LARGEST_GAIN))
 
     @property
     def width(self) -> int:
@@ -62,16 +62,16 @@ class Damping:
     def _transfer(self) -> F32:
         """Transfer function [a, b of rfft2] of L in the sums of cells."""
         rows, cols = (cells_of(n, self.width) for n in self.shape[:2])
-        down = np.fft.fftfreq(rows) * rows
-        across = np.fft.rfftfreq(cols) * cols
-        axes = ((down, rows), (across, cols))
+        row_frequencies = np.fft.fftfreq(rows) * rows
+        column_frequencies = np.fft.rfftfreq(cols) * cols
+        axes = ((row_frequencies, rows), (column_frequencies, cols))
         spectra = [
             np.maximum(spectrum_of_tents(f.astype(np.float64), n * self.width, self.width), _LEAST_OF_TENTS)
             for f, n in axes
         ]
         side = max(rows, cols)
-        cycles = np.hypot(down[:, None] * side / rows, across[None] * side / cols)
-        transfer = 1 - np.clip(cycles / _UNDAMPED, 1, self.gain) / self.gain
+        cycles = np.hypot(row_frequencies[:, None] * side / rows, column_frequencies[None] * side / cols)
+        transfer = 1 - np.clip(cycles / _UNDAMPED_CYCLES, 1, self.gain) / self.gain
         transfer = np.minimum(
             transfer / (spectra[0][:, None] * spectra[1][None]), 1 - 1 / self.gain
         )  # L must stay below 1
@@ -94,16 +94,16 @@ def largest_damped(projector: Projector, weight: F32 | None, damping: Damping) -
     SIAM J. Matrix Anal. Appl. 13, 1094.)
     """
     device = voxel_device(projector.device)
-    plain = one_of_like_rows(projector.plain, weight)
-    lines, (nz, ny, nx) = projector_on(device, plain), plain.grid.shape
+    projector_of_one_row = one_of_like_rows(projector.plain, weight)
+    lines, (nz, ny, nx) = projector_on(device, projector_of_one_row), projector_of_one_row.grid.shape
     row_damping = replace(damping, shape=(ny, nx, nz))
     root = None if weight is None else device.array(np.sqrt(weight))
-    noise = np.random.default_rng(0).standard_normal(_ray_shape(plain), np.float32)
+    noise = np.random.default_rng(0).standard_normal(_ray_shape(projector_of_one_row), np.float32)
     q = device.array(noise if weight is None else noise * (weight > 0))
     size, previous = device.norm(q), device.zeros(noise.shape)
     diagonal, off_diagonal = list[float](), list[float]()
     for _ in range(_LANCZOS_STEPS):
-        if size <= _NOTHING * math.sqrt(noise.size):
+        if size <= _ROUNDING_ERROR * math.sqrt(noise.size):
             break
         device.combine(1 / size, q, 0.0, q, q)
         back = lines.adjoint_lines(q if root is None else q * root)

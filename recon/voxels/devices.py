@@ -165,13 +165,13 @@ class _GpuProjector:
         first, *others = self._moments
         project(source, first, out)
         for rays in others:
-            more = self._device.zeros(out.shape)
-            project(source, rays, more)
-            out += more
+            further = self._device.zeros(out.shape)
+            project(source, rays, further)
+            out += further
         if others:
             out /= len(self._moments)
         return out
 
     def _spread(self, lines: Any) -> Any:
-        taken = self._projector.sharpened
-        return lines if taken is None else self._device.spread(lines, -taken[:, 0], -taken[:, 1])
+        sharpened = self._projector.sharpened
+        return lines if sharpened is None else self._device.spread(lines, -sharpened[:, 0], -sharpened[:, 1])

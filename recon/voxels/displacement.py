@@ -39,7 +39,7 @@ FARTHEST = 4.0  # largest step in pixels
 RELAXED = 1.5  # factor on a step: the corrected projections are also in the volume, so steps come out too small
 _NO_TRIALS = GoesOn(trials=GoesOn(lambda *_: False))
 _STEPS = 4  # number of steps of the first registration
-_MEASURED = 0.99  # least share of measured pixels in an interpolated pixel
+_LEAST_MEASURED_SHARE = 0.99  # least share of measured pixels in an interpolated pixel
 
 
 @dataclass(frozen=True)
@@ -97,10 +97,14 @@ def displaced(geometry: Geometry, parts: Parts, moves: Sequence[Displacement]) -
             "displacements can be corrected only in a parallel beam; in a cone beam a displaced sample changes more "
             "than the position of its image"
         )
-    x, y, z, turn, image = np.array([(m.x, m.y, m.z, m.turn, m.image) for m in moves])[parts].T
+    x, y, z, rotation, image = np.array([(m.x, m.y, m.z, m.turn, m.image) for m in moves])[parts].T
     c, s = np.cos(geometry.angles), np.sin(geometry.angles)
-    across, down = (x * c + y * s + image) / geometry.pixel_pitch, z / geometry.pixel_pitch
-    return replace(geometry, angles=geometry.angles + turn, shifts=geometry.shifts + np.stack((across, down), axis=1))
+    column_shifts, row_shifts = (x * c + y * s + image) / geometry.pixel_pitch, z / geometry.pixel_pitch
+    return replace(
+        geometry,
+        angles=geometry.angles + rotation,
+        shifts=geometry.shifts + np.stack((column_shifts, row_shifts), axis=1),
+    )
 
 
 def unmagnified(images: F32, factor: float, centre: tuple[float, float], order: int = 3) -> F32:
@@ -118,9 +122,9 @@ def unmagnified(images: F32, factor: float, centre: tuple[float, float], order: 
     return resampled
 
 
-def measured_unmagnified(there: NDArray[np.bool_], factor: float, centre: tuple[float, float]) -> NDArray[np.bool_]:
+def measured_unmagnified(measured: NDArray[np.bool_], factor: float, centre: tuple[float, float]) -> NDArray[np.bool_]:
     """Mask [view, row, col] of the pixels of `unmagnified` that come from measured pixels only."""
-    return unmagnified(there.astype(np.float32), factor, centre, order=1) > _MEASURED
+    return unmagnified(measured.astype(np.float32), factor, centre, order=1) > _LEAST_MEASURED_SHARE
 
 
 def displacements(
@@ -155,7 +159,7 @@ def displacements(
         volume = problem.volume(moves, own)
         for part in problem.others:
             views = np.flatnonzero(parts == part)
-            weight = np.exp(-0.5 * (_apart(geometry, views, own) / NEAR) ** 2)
+            weight = np.exp(-0.5 * (_angular_distances(geometry, views, own) / NEAR) ** 2)
             for _ in range(_STEPS):
                 moves[part] = problem.registered(volume, moves[part], views, weight)
     for _ in range(rounds):
@@ -235,8 +239,8 @@ class _Problem:
             own, factor = parts == part, moves[part].magnification
             data[own] = unmagnified(data[own], factor, centre)
             known[own] = measured_unmagnified(self.known[None], factor, centre)
-        there = displaced(geometry, parts, moves)
-        return data, there, (seen_rays(there, self.grid) & known).astype(np.float32)
+        displaced_geometry = displaced(geometry, parts, moves)
+        return data, displaced_geometry, (seen_rays(displaced_geometry, self.grid) & known).astype(np.float32)
 
     def volume(self, moves: Sequence[Displacement], views: NDArray[np.integer]) -> Volume:
         data, geometry, weight = self.corrected(moves, views)
@@ -256,47 +260,50 @@ class _Problem:
         """The displacement of these projections after one least-squares step (Gauss-Newton) towards the volume."""
         geometry = self.geometry.select(views)
         pitch, all_one = geometry.pixel_pitch, np.zeros(views.size, np.int64)
-        half = geometry.detector_shape[1] / 2  # in columns
-        trial = TRIAL * np.array([pitch, pitch, pitch, 1 / half, pitch, 1 / half])
-        now = np.array([move.x, move.y, move.z, move.turn, move.image, move.magnification])
+        half_width = geometry.detector_shape[1] / 2  # in columns
+        trial = TRIAL * np.array([pitch, pitch, pitch, 1 / half_width, pitch, 1 / half_width])
+        values_before = np.array([move.x, move.y, move.z, move.turn, move.image, move.magnification])
 
-        def shown(values: NDArray[np.float64]) -> F32:
-            moved = displaced(geometry, all_one, [Displacement(*values.tolist())])
-            return Projector(moved, self.grid).forward(volume.data)
+        def projected(values: NDArray[np.float64]) -> F32:
+            moved_geometry = displaced(geometry, all_one, [Displacement(*values.tolist())])
+            return Projector(moved_geometry, self.grid).forward(volume.data)
 
         data, _, rays = _Problem(self.projections[views], geometry, all_one, self.known).corrected(
             [move], np.arange(views.size)
         )
-        image = shown(now)
+        image = projected(values_before)
         residual = _without_smooth(data - image, rays)
         change: list[NDArray[np.floating]] = []
         for i in range(5 if self.optics else 4):
-            step = np.where(np.arange(now.size) == i, trial, 0)
-            change.append(_without_smooth(shown(now + step) - shown(now - step), rays) / 2)
+            step = np.where(np.arange(values_before.size) == i, trial, 0)
+            change.append(_without_smooth(projected(values_before + step) - projected(values_before - step), rays) / 2)
         if self.optics:
             change.append(_without_smooth(trial[5] * _outwards(image, geometry), rays))
-        across = np.stack(change).reshape(len(change), views.size, -1)
-        normal = np.einsum("avp,bvp,v->ab", across, across, weight, optimize=True)
-        slope = np.einsum("avp,vp,v->a", across, residual.reshape(views.size, -1), weight, optimize=True)
-        best = np.zeros(now.size)
-        best[: len(change)] = np.linalg.lstsq(normal, slope, rcond=1e-6)[0] * relaxation
-        longest = float(np.abs(best).max()) * TRIAL
-        after = now + best * trial * min(1.0, FARTHEST / max(longest, 1e-12))
-        return Displacement(*after.tolist())
+        derivatives = np.stack(change).reshape(len(change), views.size, -1)
+        normal = np.einsum("avp,bvp,v->ab", derivatives, derivatives, weight, optimize=True)
+        slope = np.einsum("avp,vp,v->a", derivatives, residual.reshape(views.size, -1), weight, optimize=True)
+        solution = np.zeros(values_before.size)
+        solution[: len(change)] = np.linalg.lstsq(normal, slope, rcond=1e-6)[0] * relaxation
+        longest = float(np.abs(solution).max()) * TRIAL
+        values_after = values_before + solution * trial * min(1.0, FARTHEST / max(longest, 1e-12))
+        return Displacement(*values_after.tolist())
 
 
 def _outwards(image: F32, geometry: Geometry) -> F32:
     """Derivative of projections [view, row, col] with respect to a magnification about the axis and the middle row."""
     rows, cols = geometry.detector_shape
-    across, down = np.arange(cols) - geometry.axis_col, np.arange(rows)[:, None] - geometry.axis_row
-    along_rows = -across * np.gradient(image, axis=2)
-    return np.asarray(along_rows - down * np.gradient(image, axis=1) if rows > 1 else along_rows, np.float32)
+    columns_from_axis = np.arange(cols) - geometry.axis_col
+    rows_from_axis = np.arange(rows)[:, None] - geometry.axis_row
+    along_rows = -columns_from_axis * np.gradient(image, axis=2)
+    return np.asarray(along_rows - rows_from_axis * np.gradient(image, axis=1) if rows > 1 else along_rows, np.float32)
 
 
-def _apart(geometry: Geometry, views: NDArray[np.integer], others: NDArray[np.integer]) -> NDArray[np.float64]:
+def _angular_distances(
+    geometry: Geometry, views: NDArray[np.integer], others: NDArray[np.integer]
+) -> NDArray[np.float64]:
     """Radians [view] from each projection to the nearest one of the others. Those 180° apart count as the same."""
-    away = np.abs(np.subtract.outer(geometry.angles[views], geometry.angles[others])) % geometry.period
-    return np.asarray(np.minimum(away, geometry.period - away).min(axis=1))
+    distances = np.abs(np.subtract.outer(geometry.angles[views], geometry.angles[others])) % geometry.period
+    return np.asarray(np.minimum(distances, geometry.period - distances).min(axis=1))
 
 
 def _without_smooth(images: F32, weight: F32) -> F32:

@@ -22,16 +22,17 @@ _FULL = 0.5  # share of the fullest row's mass that a row needs
 
 CUT_SHARE, CUT_LEAST = 0.1, 0.02  # share of the value in the middle, and line integral; lower values at an edge are air
 FARTHEST = 10.0  # largest distance of the end of a sample, in distances of the farther edge from the axis
-_EDGE = 3  # least number of columns whose mean is the level at an edge
+_EDGE_COLUMNS = 3  # least number of columns whose mean is the level at an edge
 # share of the distance to the farther edge that counts as outer columns; further in there may be a dense core
 _OUTER = 0.25
-_ALIKE = 80  # factor on the variance of independent columns; with 30, a can 3 times as wide as the field loses 0.4 dB
+# factor on the variance of independent columns; with 30, a can 3 times as wide as the field loses 0.4 dB
+_VARIANCE_FACTOR = 80
 
 
 def edge_levels(rows: F32) -> F32:
     """Line integrals [..., side] at the left and the right edge of rows [..., col]."""
     cols = rows.shape[-1]
-    n = min(max(_EDGE, cols // 100), cols)
+    n = min(max(_EDGE_COLUMNS, cols // 100), cols)
     return np.stack([part.mean(axis=-1) for part in (rows[..., :n], rows[..., cols - n :])], axis=-1)
 
 
@@ -53,14 +54,18 @@ def sample_reach(mean: F32, axis: float) -> F64:
     squared_distance, squares = (np.arange(mean.shape[1]) - axis) ** 2, np.asarray(mean, np.float64) ** 2
     slopes = []
     for part in (squared_distance >= 0, outer := squared_distance >= (1 - _OUTER) ** 2 * squared_distance.max()):
-        apart = squared_distance[part] - squared_distance[part].mean()
-        slopes.append(-(squares[:, part] @ apart) / max(float(apart @ apart), 1e-30))
+        distance_deviations = squared_distance[part] - squared_distance[part].mean()
+        slopes.append(
+            -(squares[:, part] @ distance_deviations) / max(float(distance_deviations @ distance_deviations), 1e-30)
+        )
     level = squares[:, outer].mean(axis=1)
-    rest = squares[:, outer] - level[:, None] + slopes[1][:, None] * apart
-    variance = _ALIKE * (rest**2).mean(axis=1) / max(float(apart @ apart), 1e-30)
-    differ = slopes[0] - slopes[1]
-    fall = slopes[1] + differ * variance / (variance + differ**2 + 1e-30)
-    return np.asarray(np.sqrt(squared_distance[outer].mean() + level / np.maximum(fall, 1e-30)))
+    residual = squares[:, outer] - level[:, None] + slopes[1][:, None] * distance_deviations
+    variance = (
+        _VARIANCE_FACTOR * (residual**2).mean(axis=1) / max(float(distance_deviations @ distance_deviations), 1e-30)
+    )
+    difference = slopes[0] - slopes[1]
+    slope = slopes[1] + difference * variance / (variance + difference**2 + 1e-30)
+    return np.asarray(np.sqrt(squared_distance[outer].mean() + level / np.maximum(slope, 1e-30)))
 
 
 def edges_of(views: Views) -> FieldEdges:
@@ -72,32 +77,32 @@ def edges_of(views: Views) -> FieldEdges:
     because the other half of the scan sees the missing part. So this edge is ignored. Values that are not finite, or
     have weight 0, do not count. An edge without any other value counts as air, because the box of voxels contains it.
     """
-    own = np.flatnonzero(views.geometry.is_centred)
-    geometry, cols = views.geometry.select(own), views.data.shape[2]
+    centred_views = np.flatnonzero(views.geometry.is_centred)
+    geometry, cols = views.geometry.select(centred_views), views.data.shape[2]
     width = max(2, cols // 50)
-    if own.size == 0 or cols < 2 * width:
+    if centred_views.size == 0 or cols < 2 * width:
         return FieldEdges({}, 0.0)
-    numbers = spread(np.arange(own.size), _VIEWS)
-    part = np.ix_(own[numbers], np.arange(0, views.data.shape[1], max(1, views.data.shape[1] // _ROWS)))
+    numbers = spread(np.arange(centred_views.size), _VIEWS)
+    part = np.ix_(centred_views[numbers], np.arange(0, views.data.shape[1], max(1, views.data.shape[1] // _ROWS)))
     sampled = views.data[part]
     known = np.isfinite(sampled) & (views.weights is None or views.weights[part] > 0)
     if not known.any():
         return FieldEdges({}, 0.0)
     sampled = np.where(known, sampled, np.nan)
-    mass = np.maximum(np.nan_to_num(sampled).mean(axis=(0, 2)), 0)
-    sampled = sampled[:, mass >= _FULL * mass.max()]
+    absorption = np.maximum(np.nan_to_num(sampled).mean(axis=(0, 2)), 0)
+    sampled = sampled[:, absorption >= _FULL * absorption.max()]
     edges = {"left": sampled[..., :width], "right": sampled[..., -width:]}
     if geometry.is_off_middle and covers_the_circle(geometry.angles):
-        far = "right" if geometry.axis_col < (cols - 1) / 2 else "left"
-        edges = {far: edges[far]}
+        far_side = "right" if geometry.axis_col < (cols - 1) / 2 else "left"
+        edges = {far_side: edges[far_side]}
     levels = {
         side: min(_median(part) for part in np.array_split(values, min(_PARTS, len(values))))
         for side, values in edges.items()
     }
     of_views = {side: np.array([_median(view) for view in values]) for side, values in edges.items()}
     sampled = np.nan_to_num(sampled)
-    cut = ends_in_matter(sampled.mean(axis=0))[:, [int(side == "right") for side in edges]]
-    return FieldEdges(levels, float(np.median(sampled.mean(axis=(1, 2)))), of_views, numbers, bool(cut.any()))
+    is_truncated = ends_in_matter(sampled.mean(axis=0))[:, [int(side == "right") for side in edges]]
+    return FieldEdges(levels, float(np.median(sampled.mean(axis=(1, 2)))), of_views, numbers, bool(is_truncated.any()))
 
 
 def _median(values: F32) -> float:
@@ -140,19 +145,19 @@ def columns_of_matter(geometry: Geometry, grid: Grid, images: F32) -> tuple[slic
     if not geometry.rows_show_slices or geometry.is_off_middle or any(grid.centre[1:]):
         return None
     deepest = images.mean(axis=1).max(axis=0)
-    filled = np.flatnonzero(deepest > AIR * deepest.max())
+    with_material = np.flatnonzero(deepest > AIR * deepest.max())
     axis, width = geometry.axis_col + geometry.shifts[:, 0], geometry.detector_shape[1]
-    if not filled.size:
+    if not with_material.size:
         return None
-    half = (1 + 2 * BESIDE_MATTER) * max(axis.max() - filled[0], filled[-1] - axis.min()) + 2
-    first, stop = max(0, math.floor(axis.min() - half)), min(width, math.ceil(axis.max() + half) + 1)
+    half_width = (1 + 2 * BESIDE_MATTER) * max(axis.max() - with_material[0], with_material[-1] - axis.min()) + 2
+    first, stop = max(0, math.floor(axis.min() - half_width)), min(width, math.ceil(axis.max() + half_width) + 1)
     if stop - first == width:
         return None
     views = replace(
         geometry, detector_shape=(geometry.detector_shape[0], stop - first), axis_col=geometry.axis_col - first
     )
-    across = 2 * half * geometry.sample_pitch / grid.voxel_size
-    sides = (n - 2 * max(0, math.floor((n - across) / 2)) for n in grid.shape[1:])
+    width_in_voxels = 2 * half_width * geometry.sample_pitch / grid.voxel_size
+    sides = (n - 2 * max(0, math.floor((n - width_in_voxels) / 2)) for n in grid.shape[1:])
     return slice(first, stop), views, replace(grid, shape=(grid.shape[0], *sides))
 
 
@@ -162,19 +167,19 @@ def middle_of_cone(geometry: Geometry, grid: Grid, data: F32, height: int) -> tu
     None if projections of a circular scan are displaced along the rows, or if these rows show little of the material in
     `data` [view, row, col].
     """
-    off, around = geometry.offsets[:, 1], not geometry.centres.any()
-    first = round(geometry.axis_row + (0.0 if around else float(np.median(off))) - (height - 1) / 2)
+    row_offsets, is_circular = geometry.offsets[:, 1], not geometry.centres.any()
+    first = round(geometry.axis_row + (0.0 if is_circular else float(np.median(row_offsets))) - (height - 1) / 2)
     rows = slice(first, first + height)
-    if (around and np.abs(off).max() > 1) or first < 0 or rows.stop > geometry.detector_shape[0]:
+    if (is_circular and np.abs(row_offsets).max() > 1) or first < 0 or rows.stop > geometry.detector_shape[0]:
         return None
     sampled = data[:: max(1, len(data) // 8)]
     if np.abs(sampled[:, rows]).sum() < ENOUGH_MATTER * np.abs(sampled[:, busiest_rows(sampled, height)]).sum():
         return None
     # at the far side of the field of view
-    climb = 0.0 if around else float(np.ptp(off))
-    tall = (height + 1 + climb) * geometry.sample_pitch + 2 * geometry.lean
-    tall *= 1 + geometry.reach / geometry.source_distance
-    slices = math.ceil(tall / grid.spacing[0])
+    climb = 0.0 if is_circular else float(np.ptp(row_offsets))
+    box_height = (height + 1 + climb) * geometry.sample_pitch + 2 * geometry.lean
+    box_height *= 1 + geometry.reach / geometry.source_distance
+    slices = math.ceil(box_height / grid.spacing[0])
     box = replace(grid, shape=(slices, *grid.shape[1:]), centre=(0.0, *grid.centre[1:]))
     return rows, geometry.rows(rows.start, rows.stop), box
 

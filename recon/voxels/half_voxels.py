@@ -124,13 +124,13 @@ class HalfVoxels(VoxelMethod):
         projector, decide = problem.projector, problem.decide
         if not self.halves(projector.geometry, projector.grid):
             return x
-        before = 0 if decide.ended is None else decide.ended.after
+        sweeps_before = 0 if decide.ended is None else decide.ended.after
         x = on_half_voxels(
-            problem, x, mu, lambda fine: tv_prox(fine, DUAL_STEPS * tv_steps), done=first + before,
+            problem, x, mu, lambda fine: tv_prox(fine, DUAL_STEPS * tv_steps), done=first + sweeps_before,
             sweeps=self.iterations, still=self.still, pull=pull,
         )  # fmt: skip
         if (ended := decide.ended) is not None:
-            decide.ended = ended._replace(after=before + ended.after, on_half_voxels=ended.after)
+            decide.ended = ended._replace(after=sweeps_before + ended.after, on_half_voxels=ended.after)
         return x
 
 

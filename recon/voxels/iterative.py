@@ -36,7 +36,7 @@ from recon.voxels.voxel_problem import Buffers, Units, VoxelProblem, bytes_of, t
 UNITS = "units"  # name of the decision about the units
 TV_WEIGHT_CHOSEN = "tv_weight_chosen"
 """Name of the weight of total variation that a method chose, as a value of its setting `tv_weight`."""
-_SHARE = 2**16  # fewest voxels per thread in a single slice; with fewer, threads mostly wait for each other
+_VOXELS_PER_THREAD = 2**16  # fewest voxels per thread in a single slice; with fewer, threads mostly wait for each other
 
 
 class Iterating(Protocol):
@@ -56,13 +56,13 @@ def watched(
         usual_trials: usual number of iterations of all test reconstructions, for the progress.
     """
     begin, count = control.now(), itertools.count(1)
-    most = round(MOST_TRIALS * usual_trials)
+    most_trials = round(MOST_TRIALS * usual_trials)
 
     def trial(*_: object) -> bool:
         if control.stop_of_trials():
             return False
         done = next(count)
-        total, words = (usual_trials, "as a rule") if done <= usual_trials else (max(done, most), "at most")
+        total, words = (usual_trials, "as a rule") if done <= usual_trials else (max(done, most_trials), "at most")
         control.report_progress(done, total, begin, n_views, f"{SWEEPS_OF_TRIALS} {words}")
         return True
 
@@ -130,7 +130,7 @@ def threads_for(grid: Grid) -> Iterator[None]:
     threads = get_num_threads()
     try:
         if grid.shape[0] == 1:
-            set_num_threads(max(1, min(threads, math.prod(grid.shape) // _SHARE)))
+            set_num_threads(max(1, min(threads, math.prod(grid.shape) // _VOXELS_PER_THREAD)))
         yield
     finally:
         set_num_threads(threads)
@@ -152,10 +152,10 @@ def scaled_problem(
     times_power(lines, -units.density)
     if rays is not None:
         times_power(rays, -units.weight)
-    inside = units.projector(projector)
-    at_voxels = smoothed(data, inside.resolution, None if rays is None else rays > 0)
+    scaled_projector = units.projector(projector)
+    at_voxels = smoothed(data, scaled_projector.resolution, None if rays is None else rays > 0)
     problem = VoxelProblem(
-        inside, at_voxels, rays, nonnegative, np.random.default_rng(decide.seed), go_on, decide,
+        scaled_projector, at_voxels, rays, nonnegative, np.random.default_rng(decide.seed), go_on, decide,
         measured=None if at_voxels is data else data, units=units, reach=views.reach,
     )  # fmt: skip
     return problem, lines

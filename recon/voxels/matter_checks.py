@@ -32,7 +32,7 @@ STRAY_LIMIT = 0.05
 _VIEWS, _AGREE = 24, 2  # number of examined projections; number of projections that must show a voxel as empty
 # blur in pixels; limit in standard deviations of the blurred noise; limit as a share of the 99th percentile
 _BLUR, _SIGMAS, _LEAST = 1.0, 4.0, 0.005
-_WHOLE = 0.999  # share of the rays of a voxel that must pass through air only
+_LEAST_AIR_SHARE = 0.999  # share of the rays of a voxel that must pass through air only
 # largest number of examined voxels (at least one slice is examined); the same for a volume whose rows do not show
 # slices
 _MOST, _MOST_WHOLE = 2**18, 2**21
@@ -138,7 +138,7 @@ def seen_empty(views: Views, grid: Grid) -> tuple[Mask, Mask]:
         if not air.any():
             continue
         through_air = projector.adjoint(air[None].astype(np.float32))
-        votes += (through_all > 0) & (through_air >= np.float32(_WHOLE) * through_all)
+        votes += (through_all > 0) & (through_air >= np.float32(_LEAST_AIR_SHARE) * through_all)
     return votes >= _AGREE, by_all
 
 
@@ -149,7 +149,8 @@ round off edges, up to 0.004 in sixteen fits with voxel refinement, and up to 0.
 
 _SIGNIFICANT = 4.0  # standard deviations of the noise; above it, the share of voxels with noise only is below 1e-3
 _FLIPS = 6
-_SMOOTH, _AROUND = 1.0, 4.0  # pixels: smoothing of the detail, and smoothing of the map of the noise
+# pixels: smoothing of the detail, and smoothing of the map of the noise
+_DETAIL_SMOOTHING, _NOISE_MAP_SMOOTHING = 1.0, 4.0
 _ROWS, _COLS = 8, 256  # number of rows that are used for this number of columns; fewer rows for wider detectors
 _LEAST_VIEWS = 16
 # share of the 99th percentile above which a voxel is material; radius of the closing in voxels, so that cracks belong
@@ -189,11 +190,11 @@ def unexplained(volume: Volume, views: Views, rng: np.random.Generator) -> RayCh
         The check. Its result is None for a cone, rolled or tilted projections, fewer than 16 projections, other slices,
         or a volume without material.
     """
-    nothing: RayCheck[Unexplained | None] = RayCheck((), lambda: None)
+    no_check: RayCheck[Unexplained | None] = RayCheck((), lambda: None)
     geometry, slices = views.geometry, volume.grid.shape[0]
     rows_differ = geometry.is_cone or not geometry.is_straight or volume.grid != Grid.matching(geometry)
     if rows_differ or geometry.n_views < _LEAST_VIEWS:
-        return nothing
+        return no_check
     n = min(_rows_looked_at(geometry), slices)
     mass = np.array([np.maximum(image, 0).sum(dtype=np.float64) for image in volume.data])
     middle = round(float(mass @ np.arange(slices) / mass.sum())) if mass.any() else 0
@@ -206,25 +207,25 @@ def unexplained(volume: Volume, views: Views, rng: np.random.Generator) -> RayCh
     level = _DENSE * float(np.percentile(part.data, 99))
     material = np.stack([ndimage.binary_closing(image > level, iterations=_CLOSED) for image in part.data])
     if level <= 0 or not material.any():
-        return nothing
-    shown, model = views.rows(rows), list[F32]()
+        return no_check
+    views_of_rows, model = views.rows(rows), list[F32]()
     parts = [AskedRays(np.arange(geometry.n_views), rows, lambda lines: model.append(projection_images(lines)))]
     if not in_bands(geometry, volume.grid):  # the rows also show other slices, so these slices are projected alone
-        parts, model = [], [Projector(shown.geometry, box).forward(part.data)]
-    return RayCheck(parts, lambda: _structure(shown, model[0], part, first, material, rng))
+        parts, model = [], [Projector(views_of_rows.geometry, box).forward(part.data)]
+    return RayCheck(parts, lambda: _structure(views_of_rows, model[0], part, first, material, rng))
 
 
 def _structure(
-    shown: Views, model: F32, part: Volume, first: int, material: Mask, rng: np.random.Generator
+    views: Views, model: F32, part: Volume, first: int, material: Mask, rng: np.random.Generator
 ) -> Unexplained:
     """Compute the result of `unexplained` for the slices from `first` on, whose projection is `model` [view, row,
     col].
     """
-    geometry, box = shown.geometry, part.grid
+    geometry, box = views.geometry, part.grid
     unseen = np.broadcast_to(~seen_rays(geometry, box), model.shape)
-    if shown.weights is not None:
-        unseen = unseen | (shown.weights == 0)
-    lines = np.where(unseen, np.float32(0), shown.data).swapaxes(1, 2)  # at the resolution of voxels, like the model
+    if views.weights is not None:
+        unseen = unseen | (views.weights == 0)
+    lines = np.where(unseen, np.float32(0), views.data).swapaxes(1, 2)  # at the resolution of voxels, like the model
     residual = at_voxel_resolution(lines, ViewResolution.of(geometry, box), ~unseen.swapaxes(1, 2)).swapaxes(1, 2)
     residual = residual - model
     residual[unseen] = 0
@@ -237,7 +238,7 @@ def _structure(
     averaged, variance = _smoothed(first_kind), np.zeros(box.shape, np.float32)
     for images in flipped:
         variance += _smoothed(images) ** 2 / _FLIPS
-    noise = np.sqrt(gaussian_filter(variance, (0, _AROUND, _AROUND)))
+    noise = np.sqrt(gaussian_filter(variance, (0, _NOISE_MAP_SMOOTHING, _NOISE_MAP_SMOOTHING)))
     significance = np.divide(averaged, noise, out=np.zeros_like(averaged), where=noise > 0)
     return Unexplained(float(np.mean(np.abs(significance[material]) > _SIGNIFICANT)), first, significance)
 
@@ -258,7 +259,7 @@ def _rows_looked_at(geometry: Geometry) -> int:
 
 
 def _smoothed(images: F32) -> F32:
-    return gaussian_filter(images, (0, _SMOOTH, _SMOOTH))
+    return gaussian_filter(images, (0, _DETAIL_SMOOTHING, _DETAIL_SMOOTHING))
 
 
 def _fbp_of_each(residual: F32, signs: F32, views: Geometry, box: Grid) -> list[F32]:
@@ -284,7 +285,7 @@ _MARGIN, _RIM = 4, 0.92  # blocks around material; share of the radius that all 
 _LEFT = 0.5  # a block has lost its material if its density is below this share of the density in FBP
 # size along z, y and x, in blocks, of the boxes of which a region consists; fewest blocks of a region
 _CORE, _LEAST_REGION = (3, 5, 5), 64
-_BESIDE = 2  # blocks next to slices without beam; smoothing mixes them with these slices
+_BLOCKS_BESIDE_DARK = 2  # blocks next to slices without beam; smoothing mixes them with these slices
 
 
 @dataclass(frozen=True)
@@ -322,25 +323,25 @@ def lost_matter(volume: F32, reference: F32, in_beam: NDArray[np.bool_] | None =
     ny, nx = reference_blocks.shape[1:]
     y, x = np.mgrid[:ny, :nx]
     disc = np.hypot(y - (ny - 1) / 2, x - (nx - 1) / 2) <= _RIM * min(ny, nx) / 2
-    inside = np.repeat(disc[None], len(reference_blocks), axis=0)
+    is_compared = np.repeat(disc[None], len(reference_blocks), axis=0)
     if in_beam is not None:
         blocks = in_beam[: len(reference_blocks) * factor].reshape(-1, factor).all(axis=1)
-        inside &= ndimage.binary_erosion(blocks, iterations=_BESIDE, border_value=1)[:, None, None]
+        is_compared &= ndimage.binary_erosion(blocks, iterations=_BLOCKS_BESIDE_DARK, border_value=1)[:, None, None]
     smooth = [min(_SMOOTHED_BLOCKS, n / 8) for n in reference_blocks.shape]
     reference_blocks, volume_blocks = (
         gaussian_filter(values, smooth, mode="nearest") for values in (reference_blocks, volume_blocks)
     )
-    if not inside.any():
+    if not is_compared.any():
         return None
-    reference_air, noise = air_level(reference_blocks[inside])
-    material = (reference_blocks - reference_air > _ABOVE_AIR * noise) & inside
-    air = inside & ~binary_dilation(material, iterations=_MARGIN)
+    reference_air, noise = air_level(reference_blocks[is_compared])
+    material = (reference_blocks - reference_air > _ABOVE_AIR * noise) & is_compared
+    air = is_compared & ~binary_dilation(material, iterations=_MARGIN)
     if noise == 0 or air.sum() < _LEAST_AIR:
         return None
     volume_air = float(volume_blocks[air].mean(dtype=np.float64))
-    lost = material & (volume_blocks - volume_air < _LEFT * (reference_blocks - reference_air))
-    core = [min(n, wide) for n, wide in zip(lost.shape, _CORE, strict=True)]
-    parts, n = ndimage.label(ndimage.binary_opening(lost, np.ones(core)))
+    is_lost = material & (volume_blocks - volume_air < _LEFT * (reference_blocks - reference_air))
+    core = [min(n, side) for n, side in zip(is_lost.shape, _CORE, strict=True)]
+    parts, n = ndimage.label(ndimage.binary_opening(is_lost, np.ones(core)))
     sizes = np.bincount(parts.ravel())[1:]
     if not n or sizes.max() < _LEAST_REGION:
         return None

@@ -92,18 +92,18 @@ def measured_law(
     # width of the sample over that of the field of view
     width = 1.0 if sample is None else sample.radius / geometry.reach
     slab = _Slab.of(data, geometry, width, open_beam)
-    most, held_out = split_views(slab.geometry)
-    half = split_views(slab.geometry, 2)[1]  # every second projection by angle, without the held-out ones
+    most_views, held_out = split_views(slab.geometry)
+    half_of_views = split_views(slab.geometry, 2)[1]  # every second projection by angle, without the held-out ones
     method = _TotalVariation(slab.chosen_weight())
-    volumes = [slab.volume(method, slab.views, used) for used in (half, most)]
+    volumes = [slab.volume(method, slab.views, used) for used in (half_of_views, most_views)]
     if not volumes[1].any():
         raise ValueError(
             "the error against the number of projections was not measured, because the projections show no sample"
         )
     copy, second_copy = slab.copies(volumes[1], rng)
-    copied = [slab.volume(method, copy, used) for used in (half, most)]
+    copied = [slab.volume(method, copy, used) for used in (half_of_views, most_views)]
     errors = [slab.square_error(volume, volumes[1]) for volume in copied]
-    noise = slab.square_error(copied[0], slab.volume(method, second_copy, half)) / 2 / max(errors[0], _TINY)
+    noise = slab.square_error(copied[0], slab.volume(method, second_copy, half_of_views)) / 2 / max(errors[0], _TINY)
     fall_ratio = _fall_ratio(
         [slab.unseen_power(volume, slab.views, held_out) for volume in volumes],
         [slab.unseen_power(volume, copy, held_out) for volume in copied],
@@ -115,12 +115,12 @@ def measured_law(
     constant = offset_error(Volume(volumes[1], slab.box), slab.geometry, sample)
     offset = constant / (errors[1] + constant) if constant else 0.0
     error = (_GAPS_ERROR if gaps else _EXPONENT_ERROR) * exponent
-    law = ErrorLaw(n, exponent, error, _SAME_ANGLES * exponent * (1 - offset), offset)
+    error_law = ErrorLaw(n, exponent, error, _SAME_ANGLES * exponent * (1 - offset), offset)
     if not fall_ratio or min(errors) <= 0 or (n, *views_at_ends)[-2] == n:
-        return law, None
+        return error_law, None
     # fall of the error in the scan, from half to seven eighths of the projections
     fall = _VOLUME_OVER_VIEWS * fall_ratio * math.log(errors[0] / errors[1])
-    return law, fall / math.log(len(most) / len(half)) * 10 * math.log10(n / views_at_ends[-2])
+    return error_law, fall / math.log(len(most_views) / len(half_of_views)) * 10 * math.log10(n / views_at_ends[-2])
 
 
 def _fall_ratio(scan: Sequence[float], copy: Sequence[float]) -> float | None:
@@ -213,10 +213,10 @@ class _Slab:
     def chosen_weight(self) -> float:
         """The weight of total variation, for one projection, that predicts held-out projections best."""
         by_angle = np.argsort(np.mod(self.geometry.angles, self.geometry.period), kind="stable")
-        tried = np.sort(by_angle[:: -(-len(self.views) // _TRIAL_VIEWS)])
-        self.volume(_WeightByNoise(), self.views, tried)
-        first = float(self.decisions["weight"][0] / math.sqrt(len(tried)))
-        fitted, left_out = (tried[part] for part in split_views(self.geometry.select(tried)))
+        trial_views = np.sort(by_angle[:: -(-len(self.views) // _TRIAL_VIEWS)])
+        self.volume(_WeightByNoise(), self.views, trial_views)
+        first = float(self.decisions["weight"][0] / math.sqrt(len(trial_views)))
+        fitted, left_out = (trial_views[part] for part in split_views(self.geometry.select(trial_views)))
         projector, held_out = (
             Projector(self.geometry.select(left_out), self.box),
             projection_lines(self.views[left_out]),

@@ -198,7 +198,7 @@ class OsSirtTv(VoxelMethod):
         threshold = 0.0
         # One order of the subsets, because a noisy volume never converges if each sweep ends with another subset.
         order = problem.rng if self.still == 0 else None
-        ahead = Momentum(x, problem.decide) if self.momentum else None
+        momentum = Momentum(x, problem.decide) if self.momentum else None
         standstill = Standstill(problem.decide, self.still)
         for k in range(self.iterations):
             error = sweeps.run(x, 1.0, problem.nonnegative, order)
@@ -214,8 +214,8 @@ class OsSirtTv(VoxelMethod):
             prox.turn()
             if standstill.ends(x, k + 1, problem.go_on(k + 1, math.sqrt(error) / scale)):
                 break
-            if ahead is not None and k + 1 < self.iterations:
-                ahead(x)
+            if momentum is not None and k + 1 < self.iterations:
+                momentum(x)
         standstill.report()
         if self.tv_weight is None and (unit := density_unit(x)) > 0:
             problem.decide(TV_WEIGHT_CHOSEN, lambda: threshold / unit)
@@ -272,7 +272,7 @@ class PnpDct(VoxelMethod):
         If the sample is wider than the field of view, PnP-DCT is not tried (see `Trial.wide`), unless it is the first
         method or the caller gave a threshold.
         """
-        if self.patch_threshold is None and so_far.tried and trial.wide:
+        if self.patch_threshold is None and so_far.residuals_by_number and trial.wide:
             return Prediction(
                 self.name, remark=f"{self.name} not tried, because the sample is wider than the field of view"
             )

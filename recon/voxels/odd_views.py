@@ -26,16 +26,16 @@ _BLUR = 4  # pixels; range of a blur by one pixel
 # number of rows of cells that are compared together; number of projections that are compared together
 _BAND, _TOGETHER = 16, 32
 _AT_A_TIME = 8  # number of projections of a cone beam that are computed together
-_BROAD = 3  # side of the area, in cells, over which a difference is averaged
+_CELLS_AVERAGED = 3  # side of the area, in cells, over which a difference is averaged
 # number of projections on either side that define the usual difference; number of nearest projections that are left out
-_AROUND, _BESIDE = 12, 3
+_VIEWS_AROUND, _VIEWS_BESIDE = 12, 3
 # least noise of a pixel as a share of the largest line integral; frames, and residuals of fits, have at least this
 # noise
 _LEAST_NOISE = 2e-3
 _OUTLIER = 3.0  # largest contribution of one projection, in units of the median over all projections
 _SHARP = 0.1  # a volume may miss an edge by this share of the change that a blur of one pixel causes
 _EXTENT = 0.5  # a cell belongs to the region if its score exceeds this share of the limit
-_LEAST_VIEWS = 2 * _AROUND + 1
+_LEAST_VIEWS = 2 * _VIEWS_AROUND + 1
 
 
 @dataclass(frozen=True)
@@ -68,34 +68,39 @@ def odd_views(grid: Grid, views: Views) -> RayCheck[tuple[OddView, ...]]:
         The check. Its result is the parts in the order of the projections; empty for fewer than 25 projections.
     """
     geometry, side = views.geometry, _side(views.geometry)
-    every, rows = np.arange(geometry.n_views), geometry.detector_shape[0]
-    if every.size < _LEAST_VIEWS:
+    all_views, rows = np.arange(geometry.n_views), geometry.detector_shape[0]
+    if all_views.size < _LEAST_VIEWS:
         return RayCheck((), lambda: ())
-    cells = _Cells(*(np.zeros((every.size, rows // side, geometry.detector_shape[1] // side), np.float32)
+    cells = _Cells(*(np.zeros((all_views.size, rows // side, geometry.detector_shape[1] // side), np.float32)
                      for _ in range(6)))  # fmt: skip
     if in_bands(geometry, grid):
         band, end = _band(geometry), rows - rows % side  # rows at the end that do not fill a cell do not count
-        own = [slice(first, min(first + band, end)) for first in range(0, end, band)]
-        regions = [(every, part, slice(max(part.start - _BLUR, 0), min(part.stop + _BLUR, rows))) for part in own]
+        own_rows = [slice(first, min(first + band, end)) for first in range(0, end, band)]
+        regions = [
+            (all_views, part, slice(max(part.start - _BLUR, 0), min(part.stop + _BLUR, rows))) for part in own_rows
+        ]
     else:
-        groups = (every[first : first + _AT_A_TIME] for first in range(0, every.size, _AT_A_TIME))
+        groups = (all_views[first : first + _AT_A_TIME] for first in range(0, all_views.size, _AT_A_TIME))
         regions = [(group, slice(0, rows), slice(0, rows)) for group in groups]
     parts = [
-        AskedRays(group, around, partial(_fill, cells, views, group, own, around)) for group, own, around in regions
+        AskedRays(group, projected_rows, partial(_fill, cells, views, group, own_rows, projected_rows))
+        for group, own_rows, projected_rows in regions
     ]
-    return RayCheck(parts, lambda: _odd(*_differences(cells, side), geometry, side))
+    return RayCheck(parts, lambda: _found_odd_views(*_differences(cells, side), geometry, side))
 
 
-def _odd(differences: F32, edges: F32, geometry: Geometry, side: int) -> tuple[OddView, ...]:
+def _found_odd_views(differences: F32, edges: F32, geometry: Geometry, side: int) -> tuple[OddView, ...]:
     """The odd projections, found in the `_differences` of all projections."""
     n, order, odd_views = geometry.n_views, np.argsort(geometry.angles, kind="stable"), []
-    for place in range(n):
-        first = min(max(place - _AROUND, 0), n - _LEAST_VIEWS)
-        neighbours = [k for k in range(first, first + _LEAST_VIEWS) if abs(k - place) > _BESIDE]
-        around = differences[order[neighbours]] ** 2
-        usual = np.minimum(around, _OUTLIER**2 * (1 + np.median(around, axis=0))).mean(axis=0)
-        score = differences[order[place]] / np.sqrt(
-            np.maximum(uniform_filter(usual, _BROAD) + edges[order[place]] ** 2, 1)
+    for position in range(n):
+        first = min(max(position - _VIEWS_AROUND, 0), n - _LEAST_VIEWS)
+        neighbours = [k for k in range(first, first + _LEAST_VIEWS) if abs(k - position) > _VIEWS_BESIDE]
+        neighbour_squares = differences[order[neighbours]] ** 2
+        usual_squares = np.minimum(neighbour_squares, _OUTLIER**2 * (1 + np.median(neighbour_squares, axis=0))).mean(
+            axis=0
+        )
+        score = differences[order[position]] / np.sqrt(
+            np.maximum(uniform_filter(usual_squares, _CELLS_AVERAGED) + edges[order[position]] ** 2, 1)
         )
         worst = np.unravel_index(np.abs(score).argmax(), score.shape)
         peak = float(score[worst])
@@ -103,8 +108,8 @@ def _odd(differences: F32, edges: F32, geometry: Geometry, side: int) -> tuple[O
             parts, _ = label(score * math.copysign(1, peak) > _EXTENT * LIMIT)
             region = np.nonzero(parts == parts[worst])
             spans = [(int(cells.min()) * side, (int(cells.max()) + 1) * side) for cells in region]
-            odd_views.append(OddView(int(order[place]), peak, spans[0], spans[1]))
-    return tuple(sorted(odd_views, key=lambda odd: odd.view))
+            odd_views.append(OddView(int(order[position]), peak, spans[0], spans[1]))
+    return tuple(sorted(odd_views, key=lambda odd_view: odd_view.view))
 
 
 def odd_views_memory(geometry: Geometry) -> int:
@@ -114,15 +119,15 @@ def odd_views_memory(geometry: Geometry) -> int:
     cells = (rows // side) * (cols // side)
     if in_bands(geometry, grid):
         band = min(BAND, rows)
-        own = min(_band(geometry), rows)
-        around = min(own + 2 * _BLUR, rows)
+        band_rows = min(_band(geometry), rows)
+        projected_rows = min(band_rows + 2 * _BLUR, rows)
         # two bands wait for rows that both need; the slices of a band, and the coefficients and lines of its rays
-        waiting = views * cols * (2 * around * (own < rows) + band)
+        waiting = views * cols * (2 * projected_rows * (band_rows < rows) + band)
         lines = waiting + band * height * width + views * cols * max(40, 2 * band + 16)
-        lines = max(lines, waiting + 10 * min(_TOGETHER, views) * around * cols)
+        lines = max(lines, waiting + 10 * min(_TOGETHER, views) * projected_rows * cols)
     else:  # the whole volume as lines, and some projections
         lines = math.prod(grid.shape) + 14 * min(_AT_A_TIME, views) * rows * cols
-    return 4 * (max(lines, 6 * _AROUND * cells) + 6 * views * cells)
+    return 4 * (max(lines, 6 * _VIEWS_AROUND * cells) + 6 * views * cells)
 
 
 def _side(geometry: Geometry) -> int:
@@ -135,7 +140,7 @@ def _band(geometry: Geometry) -> int:
     return _side(geometry) * max(1, _BAND // _side(geometry))
 
 
-def _sharp(models: F32) -> F32:
+def _finest_detail(models: F32) -> F32:
     """Projections [view, row, col] minus the same projections blurred by a pixel."""
     return np.abs(models - gaussian_filter(models, (0, 1, 1), truncate=_BLUR))
 
@@ -154,28 +159,31 @@ class _Cells(NamedTuple):
     plain_difference: F32
 
 
-def _fill(cells: _Cells, whole: Views, group: I64, own: slice, around: slice, lines: F32) -> None:
-    """Compute the cells of some projections in the rows `own`, from the projection of the volume in these and the
-    neighbouring rows (`around`).
+def _fill(cells: _Cells, whole: Views, group: I64, own_rows: slice, projected_rows: slice, lines: F32) -> None:
+    """Compute the cells of some projections in the rows `own_rows`, from the projection of the volume in these and the
+    neighbouring rows (`projected_rows`).
     """
-    side, rows = _side(whole.geometry), slice(own.start - around.start, own.stop - around.start)
+    side = _side(whole.geometry)
+    rows = slice(own_rows.start - projected_rows.start, own_rows.stop - projected_rows.start)
     for first in range(0, group.size, _TOGETHER):
         views = slice(int(group[0]) + first, int(group[0]) + min(first + _TOGETHER, group.size))
         images = projection_images(lines[first : first + _TOGETHER])
-        model, measured = images[:, rows], whole.data[views, own]
+        model, measured = images[:, rows], whole.data[views, own_rows]
         difference = measured - model
-        known = np.ones_like(model) if whole.weights is None else (whole.weights[views, own] > 0).astype(np.float32)
+        known = (
+            np.ones_like(model) if whole.weights is None else (whole.weights[views, own_rows] > 0).astype(np.float32)
+        )
         weight = np.sqrt(np.exp(-np.clip(measured, 0, 20))) * known
         values = (
             difference * weight,
-            _sharp(images)[:, rows] * weight,
+            _finest_detail(images)[:, rows] * weight,
             known,
             measured * weight,
             weight,
             difference * known,
         )
         for cell, value in zip(cells, values, strict=True):
-            cell[views, own.start // side : own.stop // side] = bin_views(value, side)
+            cell[views, own_rows.start // side : own_rows.stop // side] = bin_views(value, side)
 
 
 def _differences(cells: _Cells, side: int) -> tuple[F32, F32]:
@@ -183,17 +191,19 @@ def _differences(cells: _Cells, side: int) -> tuple[F32, F32]:
 
     Both are [view, cell, cell], averaged over cells, in standard deviations of the noise.
     """
-    for cell, edge, known, projection, weight, plain in zip(*cells, strict=True):
+    for cell, edge, known, projection, weight, unweighted in zip(*cells, strict=True):
         # the finest detail of the sample counts as noise
         noise = max(deviation_between_neighbours(projection, 3), _LEAST_NOISE / side * float(np.abs(projection).max()))
         if not known.any() or not noise > 0:
             cell[...], edge[...] = 0, 0
             continue
-        cell -= np.float32(np.median(plain[known > 0])) * weight
+        cell -= np.float32(np.median(unweighted[known > 0])) * weight
         # Sums over cells with known pixels, divided by their noise. There are fewer cells at an edge, and with a single
         # row.
-        known_share = uniform_filter(known, _BROAD, mode="constant")
-        scale = np.divide(_BROAD / noise, np.sqrt(known_share), out=np.zeros_like(known_share), where=known_share > 0)
-        cell[...] = uniform_filter(cell, _BROAD, mode="constant") * scale
-        edge[...] = uniform_filter(_SHARP * edge, _BROAD, mode="constant") * scale
+        known_share = uniform_filter(known, _CELLS_AVERAGED, mode="constant")
+        scale = np.divide(
+            _CELLS_AVERAGED / noise, np.sqrt(known_share), out=np.zeros_like(known_share), where=known_share > 0
+        )
+        cell[...] = uniform_filter(cell, _CELLS_AVERAGED, mode="constant") * scale
+        edge[...] = uniform_filter(_SHARP * edge, _CELLS_AVERAGED, mode="constant") * scale
     return cells.difference, cells.edges

@@ -195,13 +195,13 @@ class _Descent:
             self._rays = device.array(problem.weight)
         self._all = _Part(projector_on(device, problem.projector), slice(None))
         of_subsets = zip(subsets.projectors, subsets.views, strict=True)
-        self._parts = [_Part(projector_on(device, part), some) for part, some in of_subsets]
+        self._parts = [_Part(projector_on(device, part), rays_of_subset) for part, rays_of_subset in of_subsets]
         if len(self._parts) == 1:
             self._parts = [self._all]
         self._subsets, self._pull, self._problem = subsets, pull, problem
         self.x = device.array(x)
-        most = _MOST_MOMENTUM if subsets.is_damped else 1.0
-        self._gradient, self._ahead = device.copy(self.x), Momentum(self.x, problem.decide, device, most)
+        largest_momentum = _MOST_MOMENTUM if subsets.is_damped else 1.0
+        self._gradient, self._ahead = device.copy(self.x), Momentum(self.x, problem.decide, device, largest_momentum)
         self._slope: Any = None  # cells of the gradient of the prior (total variation and x >= 0) at the last point
         self._target: Any = None
         self.error, self.seen = 0.0, list[F32]()
@@ -234,9 +234,9 @@ class _Descent:
         data, rays = self._data[part.views], None if self._rays is None else self._rays[part.views]
         self.error += device.replace_by_residual(data, residual, rays)
         if looked_at:
-            some = sampled_views(count, len(residual))
-            unweighted = np.array(device.numpy(residual[some]))
-            self.seen.append(whitened(unweighted, None if rays is None else device.numpy(rays[some])))
+            sampled = sampled_views(count, len(residual))
+            unweighted = np.array(device.numpy(residual[sampled]))
+            self.seen.append(whitened(unweighted, None if rays is None else device.numpy(rays[sampled])))
         if rays is not None:
             residual *= rays
         part.projector.adjoint_lines(residual, self._gradient)
@@ -255,11 +255,11 @@ class _Descent:
                 cells -= self._slope * np.float32(1 / count)
             damping.take_off(device, self._gradient, cells)
         device.combine(1.0, x, length, self._gradient, x)
-        before = damping.cells(device, x) if damping.gain > 1 else None
+        last_cells = damping.cells(device, x) if damping.gain > 1 else None
         self._prox(x, mu * length)
         self._prox.turn()
-        if before is not None:
-            self._slope = before
+        if last_cells is not None:
+            self._slope = last_cells
             self._slope -= damping.cells(device, x)
             self._slope *= np.float32(count / length)
 

@@ -183,20 +183,20 @@ def towards_views(
     """
     device, pull = voxel_device(problem.projector.device), PULL * bound
     projector, data, rays = views
-    centre, half = pull + bound / 2, bound / 2
+    centre, half_range = pull + bound / 2, bound / 2
     change, gradient = device.zeros(x.shape), device.copy(x)
-    scale, momentum, pace = problem.scale, 0.0, 1 / centre
+    scale, momentum, step_length = problem.scale, 0.0, 1 / centre
     for k in range(steps):
         residual = projector.forward_lines(x)
         error = device.replace_by_residual(data, residual, rays)
         if rays is not None:
             residual *= rays
         projector.adjoint_lines(residual, gradient)
-        device.pulled_step(x, change, momentum, pace, gradient, pull, z, problem.nonnegative)
+        device.pulled_step(x, change, momentum, step_length, gradient, pull, z, problem.nonnegative)
         if not problem.go_on(done + k + 1, math.sqrt(error) / scale):
             return False
-        after = 1 / (centre - half**2 * pace / (2 if k == 0 else 4))
-        momentum, pace = after * centre - 1, after
+        next_step_length = 1 / (centre - half_range**2 * step_length / (2 if k == 0 else 4))
+        momentum, step_length = next_step_length * centre - 1, next_step_length
     return True
 
 

@@ -90,11 +90,11 @@ class _Compared(NamedTuple):
     grid: Grid
     rows: slice
     views: I64
-    places: I64  # of the views among all compared ones
+    positions: I64  # of the views among all compared ones
 
 
-def residual(grid: Grid, views: Views, most: int) -> RayCheck[tuple[SquaresLeft, float]]:
-    """The residual of a volume on this grid in at most `most` projections, evenly spread.
+def residual(grid: Grid, views: Views, most_views: int) -> RayCheck[tuple[SquaresLeft, float]]:
+    """The residual of a volume on this grid in at most `most_views` projections, evenly spread.
 
     If a detector has more than 2^17 pixels, only bands of rows with about this number of pixels are used.
 
@@ -102,19 +102,25 @@ def residual(grid: Grid, views: Views, most: int) -> RayCheck[tuple[SquaresLeft,
         The check. Its result is the sums of these projections, and the residual of the volume along rows, see
         `uniform_residual`.
     """
-    compared = list(_compared(grid, views, most))
-    sums, along = np.zeros((3, 1 + max(int(each.places[-1]) for each in compared))), np.zeros(2)
+    compared = list(_compared(grid, views, most_views))
+    sums, squares_along_rows = np.zeros((3, 1 + max(int(each.positions[-1]) for each in compared))), np.zeros(2)
 
     def compare(part: _Compared, model: F32) -> None:
-        lines, counts, shown = _measured(views, part)
-        sums[:, part.places] += _summed(model - shown, lines, counts)
-        along[:] += [np.square(_without_means(image, counts)).sum() for image in (model - shown, lines)]
+        lines, counts, measured = _measured(views, part)
+        sums[:, part.positions] += _summed(model - measured, lines, counts)
+        squares_along_rows[:] += [np.square(_without_means(image, counts)).sum() for image in (model - measured, lines)]
 
     parts = [AskedRays(each.views, each.rows, partial(compare, each)) for each in compared]
-    return RayCheck(parts, lambda: (SquaresLeft(*sums), math.sqrt(along[0] / along[1]) if along[1] else 0.0))
+    return RayCheck(
+        parts,
+        lambda: (
+            SquaresLeft(*sums),
+            math.sqrt(squares_along_rows[0] / squares_along_rows[1]) if squares_along_rows[1] else 0.0,
+        ),
+    )
 
 
-def uniform_residual(grid: Grid, views: Views, most: int) -> tuple[float, int]:
+def uniform_residual(grid: Grid, views: Views, most_views: int) -> tuple[float, int]:
     """The residual along rows of a volume of uniform density, in the projections that `residual` compares.
 
     A residual along rows is computed after the mean of each row is subtracted, because the mean also contains material
@@ -126,30 +132,31 @@ def uniform_residual(grid: Grid, views: Views, most: int) -> tuple[float, int]:
         The residual (0 if the rays do not differ from the mean of their row), and the number of projected rays.
     """
     _, y, x = grid.coordinates()
-    inside = (np.hypot(y[:, None], x) < grid.spacing[1] * min(grid.shape[1:]) / 2).astype(np.float32)
-    own, total, products, norms, rays = 0.0, 0.0, np.zeros(2), np.zeros(2), 0
-    for part in _compared(grid, views, most):
-        lines, counts, shown = _measured(views, part)
-        projector, flat = Projector(part.geometry, part.grid), _without_means(shown, counts)
-        own, total = own + float(np.vdot(flat, flat)), total + float(np.square(_without_means(lines, counts)).sum())
-        for n, mask in enumerate((inside, np.ones_like(inside))):
+    cylinder = (np.hypot(y[:, None], x) < grid.spacing[1] * min(grid.shape[1:]) / 2).astype(np.float32)
+    squares_of_data, total, products, norms, rays = 0.0, 0.0, np.zeros(2), np.zeros(2), 0
+    for part in _compared(grid, views, most_views):
+        lines, counts, measured = _measured(views, part)
+        projector, without_means = Projector(part.geometry, part.grid), _without_means(measured, counts)
+        squares_of_data = squares_of_data + float(np.vdot(without_means, without_means))
+        total = total + float(np.square(_without_means(lines, counts)).sum())
+        for n, mask in enumerate((cylinder, np.ones_like(cylinder))):
             uniform = np.broadcast_to(mask, part.grid.shape)
             image = _without_means(projector.forward_lines(volume_lines(uniform)), counts)
-            products[n] += np.vdot(flat, image)
+            products[n] += np.vdot(without_means, image)
             norms[n] += np.vdot(image, image)
         rays += 2 * lines.size
-    least = own - np.divide(products**2, norms, out=np.zeros(2), where=norms > 0).max()
-    return math.sqrt(max(least, 0.0) / total) if total else 0.0, rays
+    least_squares = squares_of_data - np.divide(products**2, norms, out=np.zeros(2), where=norms > 0).max()
+    return math.sqrt(max(least_squares, 0.0) / total) if total else 0.0, rays
 
 
-def _compared(grid: Grid, views: Views, most: int) -> Iterator[_Compared]:
-    sampled_views, bands = spread(np.arange(views.geometry.n_views), most), in_bands(views.geometry, grid)
+def _compared(grid: Grid, views: Views, most_views: int) -> Iterator[_Compared]:
+    sampled_views, bands = spread(np.arange(views.geometry.n_views), most_views), in_bands(views.geometry, grid)
     # Without bands of rows, groups of projections save memory.
-    for places in np.array_split(np.arange(sampled_views.size), 1 if bands else min(sampled_views.size, _GROUPS)):
-        geometry = views.geometry.select(sampled_views[places])
+    for positions in np.array_split(np.arange(sampled_views.size), 1 if bands else min(sampled_views.size, _GROUPS)):
+        geometry = views.geometry.select(sampled_views[positions])
         for rows in _bands(views, sampled_views) if bands else [slice(0, geometry.detector_shape[0])]:
-            _, shown, slices = part_of(geometry, grid, rows) if bands else (rows, geometry, grid)
-            yield _Compared(shown, slices, rows, sampled_views[places], places)
+            _, part, slices = part_of(geometry, grid, rows) if bands else (rows, geometry, grid)
+            yield _Compared(part, slices, rows, sampled_views[positions], positions)
 
 
 def _measured(views: Views, part: _Compared) -> tuple[F32, Mask, F32]:
@@ -180,7 +187,7 @@ def _bands(views: Views, sampled_views: I64) -> list[slice]:
     if rows <= bands * BAND:
         return [slice(first, min(first + BAND, rows)) for first in range(0, rows, BAND)]
     absorption = np.maximum(sum(np.nansum(views.data[view], axis=1, dtype=np.float64) for view in sampled_views), 0)
-    reached = np.cumsum(absorption if absorption.any() else np.ones(rows))
-    middles = np.searchsorted(reached, (np.arange(bands) + 0.5) / bands * reached[-1])
-    starts = np.unique(np.clip(middles - BAND // 2, 0, rows - BAND))
-    return [slice(first, first + BAND) for first in starts.tolist()]
+    cumulative = np.cumsum(absorption if absorption.any() else np.ones(rows))
+    middles = np.searchsorted(cumulative, (np.arange(bands) + 0.5) / bands * cumulative[-1])
+    first_rows = np.unique(np.clip(middles - BAND // 2, 0, rows - BAND))
+    return [slice(first, first + BAND) for first in first_rows.tolist()]

@@ -31,9 +31,10 @@ _MOST = (
     1 / 6
 )  # px²; excess that sharpening corrects, which is that of voxels as wide as pixels. The rest smooths the projections
 _ALL = 1 / 6  # variance of the interpolation in squared edges, averaged over all distances
-_ON_ROWS = 1e-6  # distance in slices up to which slices count as being on the rows
-_NOTHING = 1e-9  # px²; rounding error
-_STILL = 0.1  # voxels; if a ray drifts by less than this within the box, it crosses all planes at the same position
+_ROW_TOLERANCE = 1e-6  # distance in slices up to which slices count as being on the rows
+_ROUNDING_ERROR = 1e-9  # px²; rounding error
+# voxels; if a ray drifts by less than this within the box, it crosses all planes at the same position
+_LARGEST_DRIFT = 0.1
 _DIGITS = 4  # digits of a variance, so that it does not depend on where a slab begins
 _PAD = 16  # px beyond the edges to which the outer pixels are repeated
 
@@ -84,7 +85,7 @@ class ViewResolution:
         squares = self.voxels**2
         own = squares.sum(2) / 12 + (squares * self.interpolation[:, None]).sum(2)
         excess = own - sum(self.views)
-        return np.where(np.abs(excess) > _NOTHING, excess, 0.0)
+        return np.where(np.abs(excess) > _ROUNDING_ERROR, excess, 0.0)
 
     @property
     def sharpened(self) -> F64:
@@ -104,7 +105,7 @@ class ViewResolution:
     def smoothed(self) -> F64:
         """Variance [view, 2] in px² added to measured projections, because coarse voxels show no sharp edges."""
         beyond = self.excess - self._most[:, None]
-        return np.where(beyond > _NOTHING, beyond, 0.0)
+        return np.where(beyond > _ROUNDING_ERROR, beyond, 0.0)
 
     def transfer(self, axis: int, f: F64) -> F64:
         """Transfer function [view, frequency] of the model relative to measured projections, at f cycles per pixel."""
@@ -128,7 +129,9 @@ def on_rows(geometry: Geometry, grid: Grid) -> bool:
         return False
     first, step = levels(geometry, grid)
     nz = grid.shape[0]
-    return nz == geometry.detector_shape[0] and bool(np.abs(first).max() < _ON_ROWS and abs(step - 1) * nz < _ON_ROWS)
+    return nz == geometry.detector_shape[0] and bool(
+        np.abs(first).max() < _ROW_TOLERANCE and abs(step - 1) * nz < _ROW_TOLERANCE
+    )
 
 
 def levels(geometry: Geometry, grid: Grid) -> tuple[F64, float]:
@@ -154,11 +157,11 @@ def _interpolation(geometry: Geometry, grid: Grid, axes: F64) -> F64:
     offset = first[across][:, None] * lean - geometry.pixel_pitch * (origin[:, :1] * col + origin[:, 1:] * row) - first
     scale = geometry.pixel_pitch / edges
     steps = (
-        (scale * row, 1 / _ON_ROWS * _STILL),  # so that slabs agree
+        (scale * row, 1 / _ROW_TOLERANCE * _LARGEST_DRIFT),  # so that slabs agree
         (scale * col, geometry.detector_shape[1]),
         (edges[across][:, None] * lean / edges, count[across][:, None]),
     )
-    still = np.all([np.abs(step - np.rint(step)) * many < _STILL for step, many in steps], axis=0)
+    still = np.all([np.abs(step - np.rint(step)) * many < _LARGEST_DRIFT for step, many in steps], axis=0)
     d = offset / edges
     d -= np.floor(d)
     return np.where(still & (variances > 0), np.round(d * (1 - d), _DIGITS), variances)

@@ -19,8 +19,8 @@ _SIDE = 511  # largest side of a slice in voxels; wider projections are binned
 # largest number of projections that are used, enough for this side. If there are more, some are left out, evenly by
 # angle.
 _VIEWS = 400
-_BRIGHT = 0.5  # share of the 99th percentile; the slices cross in the middle of the voxels above it
-_AT_ONCE = 32  # number of projections that are filtered together
+_MATERIAL_SHARE = 0.5  # share of the 99th percentile; the slices cross in the middle of the voxels above it
+_VIEWS_AT_ONCE = 32  # number of projections that are filtered together
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ def orthogonal_slices(views: Sequence[F32], geometry: Geometry) -> OrthogonalSli
     nz, ny, nx = grid.shape
     middle = grid.part(slice(nz // 2, nz // 2 + 1), slice(0, ny), slice(0, nx))
     across = fbp(data, geometry, middle, "hann")[0]
-    weights = across >= _BRIGHT * np.percentile(across, 99)
+    weights = across >= _MATERIAL_SHARE * np.percentile(across, 99)
     j, i = (int(np.average(np.arange(n), weights=weights.sum(axis))) for axis, n in ((1, ny), (0, nx)))
     z, y, x = grid.coordinates()
     lines = np.stack([np.concatenate([x, np.full(ny, x[i])]), np.concatenate([np.full(nx, y[j]), y])])
@@ -94,8 +94,8 @@ def _along(data: F32, geometry: Geometry, points: F64) -> F32:
     out = np.zeros((points.shape[1], data.shape[1]), np.float32)
     beyond, weights = continuation(data.mean(axis=0), geometry, weights, zeros, "hann")
     shares, pitch = weights.astype(np.float32)[:, None, 1:-1], geometry.pixel_pitch
-    for first in range(0, geometry.n_views, _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
+    for first in range(0, geometry.n_views, _VIEWS_AT_ONCE):
+        part = slice(first, first + _VIEWS_AT_ONCE)
         weighed = np.pad(data[part] * shares[part], ((0, 0), (0, 0), zeros))
         filtered = filter_projections(weighed, pitch, "hann")
         if beyond is not None:

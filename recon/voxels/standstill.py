@@ -52,9 +52,11 @@ class Standstill:
         self._done = done
         since = done - 1 - self._first
         if since >= 0 and since % MIRRORED == 0:
-            before, self._change = self._change, self._change_of(x)
-            still = self._change < self._still and (not self._from_rest or self._change <= before < math.inf)
-            if self._decide(_STILL, partial(bool, still)):
+            last_change, self._change = self._change, self._change_of(x)
+            has_converged = self._change < self._still and (
+                not self._from_rest or self._change <= last_change < math.inf
+            )
+            if self._decide(_STILL, partial(bool, has_converged)):
                 self._ended = "still"
                 return True
         if not going:
@@ -65,9 +67,9 @@ class Standstill:
         """Record how the sweeps ended. If the change of the last sweeps is not known, the change of the sweeps before
         is recorded.
         """
-        before = self._decide.ended
-        change = self._change if before is None or self._change < math.inf else before.change
-        self._decide.ended = IterationEnd(self._ended, self._done, change, before and before.on_half_voxels)
+        last_end = self._decide.ended
+        change = self._change if last_end is None or self._change < math.inf else last_end.change
+        self._decide.ended = IterationEnd(self._ended, self._done, change, last_end and last_end.on_half_voxels)
 
     def _change_of(self, x: Any) -> float:
         """Distance of the volume from the volume of the last call, divided by the norm; infinite at the first call."""
@@ -83,10 +85,12 @@ class Standstill:
 
 
 def with_quality(method: MethodT, quality: Quality) -> MethodT:
-    """A method with `still` and `iterations` changed for a preset: "best" ends nearer to the minimum, "preview" farther
-    from it.
+    """A method with `still_factor` and `iterations` changed for a preset: "best" ends nearer to the minimum, "preview"
+    farther from it.
     """
-    still, longer = _QUALITIES[quality]
+    still_factor, iterations_factor = _QUALITIES[quality]
     settings: Any = method
-    changed: MethodT = replace(settings, still=still * settings.still, iterations=longer * settings.iterations)
+    changed: MethodT = replace(
+        settings, still=still_factor * settings.still, iterations=iterations_factor * settings.iterations
+    )
     return changed

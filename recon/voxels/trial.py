@@ -153,7 +153,7 @@ class TrialSettings:
     early: bool = False
 
 
-_USUAL = TrialSettings()
+_USUAL_SETTINGS = TrialSettings()
 
 
 @runtime_checkable
@@ -210,7 +210,7 @@ class Trial:
         self.smooth: F32 | None = None
 
     @classmethod
-    def of(cls, problem: VoxelProblem, settings: TrialSettings = _USUAL) -> Trial | None:
+    def of(cls, problem: VoxelProblem, settings: TrialSettings = _USUAL_SETTINGS) -> Trial | None:
         """The trial of the rows with the most material; for a cone beam, of the rows in the middle.
 
         Columns of air far from the sample are left out.
@@ -238,22 +238,22 @@ class Trial:
         matter: tuple[slice, Geometry, Grid] | None = None,
     ) -> Trial | None:  # fmt: skip
         def of_views(chosen: NDArray[np.intp], cols: slice, views: Geometry, box: Grid) -> VoxelProblem:
-            def cut(rays: F32) -> F32:
+            def of_rows(rays: F32) -> F32:
                 return np.ascontiguousarray(rays[chosen][:, cols, rows])
 
             return replace(
                 problem,
                 projector=replace(problem.projector, geometry=views.select(chosen), grid=box),
-                data=cut(problem.data),
-                measured=None if problem.measured is None else cut(problem.measured),
-                weight=None if problem.weight is None else cut(problem.weight),
+                data=of_rows(problem.data),
+                measured=None if problem.measured is None else of_rows(problem.measured),
+                weight=None if problem.weight is None else of_rows(problem.weight),
                 rng=np.random.default_rng(0),
                 go_on=GoesOn(trials=problem.go_on.trials),
                 decide=Decisions(),
             )
 
         cols, narrow, narrow_box = matter or (slice(None), views, box)
-        seen, unseen = (of_views(some, cols, narrow, narrow_box) for some in split_views(views))
+        seen, unseen = (of_views(view_numbers, cols, narrow, narrow_box) for view_numbers in split_views(views))
         if unseen.weight is not None and not unseen.weight.any(axis=(1, 2)).any():
             return None
         wide = _is_wide(problem)
@@ -409,7 +409,7 @@ class Trial:
     def lines_of(self, volume: Volume) -> F32:
         """A volume made from `views_of`, converted to one of the trial, [y, x, z]."""
         shape = self.problem.projector.grid.shape
-        y, x = ((many - few) // 2 for many, few in zip(volume.data.shape[1:], shape[1:], strict=True))
+        y, x = ((n_given - n_wanted) // 2 for n_given, n_wanted in zip(volume.data.shape[1:], shape[1:], strict=True))
         part = np.maximum(volume.data[:, y : y + shape[1], x : x + shape[2]], 0)
         return times_power(volume_lines(part), -self.problem.units.density)
 
@@ -429,10 +429,10 @@ class Trial:
         Args:
             sweeps: largest number; None: until the volume has converged, or as for a voxel refinement.
         """
-        most = sweeps or (TRIAL_SWEEPS if self.settings.early else MOST_SWEEPS)
+        most_sweeps = sweeps or (TRIAL_SWEEPS if self.settings.early else MOST_SWEEPS)
         steps = EARLY_TV_STEPS if self.settings.early else TV_STEPS
         return self.volume_by(lambda part, x: ordered_fista(
-            part, x, TvWeight(weight), self._subsets, sweeps=most, prox=tv_prox(part, steps), pull=pull,
+            part, x, TvWeight(weight), self._subsets, sweeps=most_sweeps, prox=tv_prox(part, steps), pull=pull,
             still=STILL_IN_TRIAL,
         ), start)  # fmt: skip
 

@@ -13,9 +13,9 @@ from recon.base.geometry import Geometry
 
 _GAP_LIMIT = 8.0  # an angular gap this many times the usual one may be missing data, not coarse sampling
 # a wider gap is missing data, even if there are many such gaps, unless most projections are as far apart
-_FAR = np.pi / 6
-_THINNED = 2.5  # most usual steps between the projections of a part of a scan
-_ALIKE = 0.4  # standard deviation of gaps over their mean: 0.24 for golden angles, about 0.7 for random ones
+_WIDEST_USUAL_ANGLE = np.pi / 6
+_MOST_USUAL_STEPS = 2.5  # most usual steps between the projections of a part of a scan
+_NOT_RANDOM = 0.4  # standard deviation of gaps over their mean: 0.24 for golden angles, about 0.7 for random ones
 _SAME_ANGLE = 1e-3  # share of the mean step; projections that are closer share one weight
 
 
@@ -46,18 +46,18 @@ def angular_weights(angles: ArrayLike, whole_scan: ArrayLike | None = None) -> N
     # Group equal angles. Angles are periodic, so a last group just below π may belong to the first group.
     tolerance = _SAME_ANGLE * np.pi / theta.size
     group = np.concatenate([[0], np.cumsum(np.diff(ordered) > tolerance)])
-    starts = ordered[np.concatenate([[True], np.diff(group) > 0])]
-    if group[-1] > 0 and starts[0] + np.pi - ordered[-1] <= tolerance:
+    first_angles = ordered[np.concatenate([[True], np.diff(group) > 0])]
+    if group[-1] > 0 and first_angles[0] + np.pi - ordered[-1] <= tolerance:
         group[group == group[-1]] = 0
-        starts = starts[:-1]
-    if starts.size == 1:
+        first_angles = first_angles[:-1]
+    if first_angles.size == 1:
         return np.full(theta.size, (np.pi if whole is None else _usual_step(whole)) / theta.size)
-    gaps = np.diff(starts, append=starts[0] + np.pi)
+    gaps = np.diff(first_angles, append=first_angles[0] + np.pi)
     if whole is None:
         typical, missing = float(np.median(gaps)), _missing(gaps, math.pi)
     else:
-        typical, half = _usual_step(whole), _half_step(_different(whole))
-        missing = gaps > _GAP_LIMIT * np.clip(_half_step(gaps), half, _THINNED * half)
+        typical, usual_half_step = _usual_step(whole), _half_step(_different(whole))
+        missing = gaps > _GAP_LIMIT * np.clip(_half_step(gaps), usual_half_step, _MOST_USUAL_STEPS * usual_half_step)
     gaps = np.where(missing, typical, gaps)
     cells = (gaps + np.roll(gaps, 1)) / 2
     weights = np.empty_like(theta)
@@ -82,9 +82,9 @@ def _half_step(gaps: F64) -> float:
 
     For groups, it is that between groups.
     """
-    most = np.sort(gaps)[:-1] if gaps.size > 1 else gaps
-    total = np.cumsum(most)
-    return float(most[np.searchsorted(total, total[-1] / 2)])
+    without_widest = np.sort(gaps)[:-1] if gaps.size > 1 else gaps
+    total = np.cumsum(without_widest)
+    return float(without_widest[np.searchsorted(total, total[-1] / 2)])
 
 
 def covers_the_circle(angles: ArrayLike) -> bool:
@@ -133,11 +133,11 @@ def ray_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
         Weights [view, 1 + col + 1], the first and the last for values beyond the edges (0 if an opposite projection
         sees them), and the numbers of columns of zeros to add before and after.
     """
-    both = np.repeat(angular_weights(geometry.angles)[:, None], geometry.detector_shape[1] + 2, axis=1)
+    weights_of_views = np.repeat(angular_weights(geometry.angles)[:, None], geometry.detector_shape[1] + 2, axis=1)
     if not covers_the_circle(geometry.angles):
-        return both, (0, 0)
-    share, beyond = column_shares(geometry)
-    return _weighed(share, both, circle_weights(geometry.angles)[:, None]), beyond
+        return weights_of_views, (0, 0)
+    share, zeros = column_shares(geometry)
+    return _weighed(share, weights_of_views, circle_weights(geometry.angles)[:, None]), zeros
 
 
 def column_shares(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
@@ -211,8 +211,8 @@ def fan_shares(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
     if not geometry.is_off_middle:
         return np.full(cols + 2, 0.5), (0, 0)
     axis = np.array([geometry.axis_col + geometry.shifts[:, 0].mean()])
-    share, beyond = _shares(cols, axis, axis)
-    return share[0], beyond
+    share, zeros = _shares(cols, axis, axis)
+    return share[0], zeros
 
 
 def cone_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
@@ -229,20 +229,20 @@ def cone_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
         ValueError: some rays of the field of view are not seen by any projection.
     """
     if covers_the_circle(geometry.angles):
-        shares, beyond = fan_shares(geometry)
-        return circle_weights(geometry.angles)[:, None] * shares, beyond
+        shares, zeros = fan_shares(geometry)
+        return circle_weights(geometry.angles)[:, None] * shares, zeros
     order, beta, cells = _arc(geometry.angles)
-    lacking = missing_arc(geometry)
-    if lacking > 0:
-        more = f"{np.rad2deg(lacking):.4g} degrees more" if lacking < math.inf else "angles without several gaps"
+    missing = missing_arc(geometry)
+    if missing > 0:
+        needed_text = f"{np.rad2deg(missing):.4g} degrees more" if missing < math.inf else "angles without several gaps"
         raise ValueError(
             "use an iterative method (fista-tv, sirt), or take a full circle or a short scan of 180 degrees plus the "
-            f"fan angle. FDK needs {more}, because some rays through the field of view are in no projection"
+            f"fan angle. FDK needs {needed_text}, because some rays through the field of view are in no projection"
         )
     arc, gamma = float(cells.sum()), -_fan_angles(geometry)[order]
-    most = (arc - np.pi) / 2
-    rise = np.clip(beta[:, None] / (most - gamma), 0, 2)
-    fall = np.clip((arc - beta[:, None]) / (most + gamma), 0, 2)
+    largest_fan_angle = (arc - np.pi) / 2
+    rise = np.clip(beta[:, None] / (largest_fan_angle - gamma), 0, 2)
+    fall = np.clip((arc - beta[:, None]) / (largest_fan_angle + gamma), 0, 2)
     weights = np.empty_like(gamma)
     weights[order] = (np.sin(np.pi / 4 * rise) * np.sin(np.pi / 4 * fall)) ** 2 * cells[:, None]
     return np.pad(weights, ((0, 0), (1, 1)), mode="edge"), (0, 0)
@@ -281,20 +281,20 @@ def unseen_wedges(geometry: Geometry) -> list[Wedge]:
     For a short scan of a cone, the wedge is `missing_arc`, because rays at the rim of the field are missing before
     those at the axis.
     """
-    lacking = missing_arc(geometry) if geometry.is_cone else math.inf
-    if lacking == 0 or (geometry.is_off_middle and covers_the_circle(geometry.angles)):
+    missing = missing_arc(geometry) if geometry.is_cone else math.inf
+    if missing == 0 or (geometry.is_off_middle and covers_the_circle(geometry.angles)):
         return []
-    if math.isfinite(lacking):
+    if math.isfinite(missing):
         order, _, cells = _arc(geometry.angles)
         middle = geometry.angles[order[0]] + (float(cells.sum()) - float(cells[0]) + math.pi) / 2
-        return [Wedge(float(np.mod(middle - lacking / 2, np.pi)), min(lacking, math.pi))]
+        return [Wedge(float(np.mod(middle - missing / 2, np.pi)), min(missing, math.pi))]
     theta = np.unique(np.mod(geometry.angles, np.pi))
     gaps = np.diff(theta, append=theta[0] + np.pi)
     typical = float(np.median(gaps))
     if math.pi - float(angular_weights(geometry.angles).sum()) < typical / 2:
         return []
-    wide = np.flatnonzero(_missing(gaps, math.pi))
-    return [Wedge(float(np.mod(theta[gap] + typical / 2, np.pi)), float(gaps[gap] - typical)) for gap in wide]
+    wide_gaps = np.flatnonzero(_missing(gaps, math.pi))
+    return [Wedge(float(np.mod(theta[gap] + typical / 2, np.pi)), float(gaps[gap] - typical)) for gap in wide_gaps]
 
 
 def density_gain(geometry: Geometry) -> float:
@@ -315,9 +315,9 @@ def density_errors(missing: float, aspect: float = 2.0) -> tuple[float, float]:
         missing: radians without projections, of π.
         aspect: length of the body over its width.
     """
-    lost = [2 / math.pi * math.atan(factor * math.tan(missing / 2)) for factor in (aspect, 1 / aspect)]
-    most, least = ((1 - share) / (1 - missing / math.pi) - 1 for share in lost)
-    return most, least
+    lost_shares = [2 / math.pi * math.atan(factor * math.tan(missing / 2)) for factor in (aspect, 1 / aspect)]
+    highest, lowest = ((1 - share) / (1 - missing / math.pi) - 1 for share in lost_shares)
+    return highest, lowest
 
 
 def _missing(gaps: F64, circle: float) -> NDArray[np.bool_]:
@@ -326,8 +326,8 @@ def _missing(gaps: F64, circle: float) -> NDArray[np.bool_]:
     One of n random gaps exceeds a share x of the circle with a probability of at most n (1 - x)^(n - 1). The limit is 1
     in 1000, or 1 in 20 if the other gaps are so similar that the angles are not random.
     """
-    chance = 1e-3 if (others := np.sort(gaps)[:-1]).std() > _ALIKE * others.mean() else 0.05
-    return gaps > max(_GAP_LIMIT * _usual(gaps), circle * (1 - (chance / gaps.size) ** (1 / (gaps.size - 1))))
+    probability = 1e-3 if (others := np.sort(gaps)[:-1]).std() > _NOT_RANDOM * others.mean() else 0.05
+    return gaps > max(_GAP_LIMIT * _usual(gaps), circle * (1 - (probability / gaps.size) ** (1 / (gaps.size - 1))))
 
 
 def _usual(gaps: F64) -> float:
@@ -337,7 +337,7 @@ def _usual(gaps: F64) -> float:
     or the median if that is larger. So projections are missing in wider gaps, even if there are many such gaps.
     """
     median = float(np.median(gaps))
-    return min(max(_half_step(gaps), median), max(_FAR / _GAP_LIMIT, median))
+    return min(max(_half_step(gaps), median), max(_WIDEST_USUAL_ANGLE / _GAP_LIMIT, median))
 
 
 def _arc(angles: F64) -> tuple[NDArray[np.intp], F64, F64]:
@@ -347,9 +347,9 @@ def _arc(angles: F64) -> tuple[NDArray[np.intp], F64, F64]:
     order = np.roll(order, -1 - int(np.argmax(gaps)))
     beta = np.mod(theta[order] - theta[order[0]], 2 * np.pi)
     steps = np.diff(beta)
-    ends = float(np.median(steps)) if steps.size else 0.0
-    steps = np.concatenate(([ends], steps, [ends]))
-    return order, beta + ends / 2, (steps[1:] + steps[:-1]) / 2
+    usual_step = float(np.median(steps)) if steps.size else 0.0
+    steps = np.concatenate(([usual_step], steps, [usual_step]))
+    return order, beta + usual_step / 2, (steps[1:] + steps[:-1]) / 2
 
 
 def _fan_angles(geometry: Geometry) -> F64:
@@ -370,11 +370,15 @@ def _shares(cols: int, axis: F64, opposite: F64) -> tuple[F64, tuple[int, int]]:
     share = 0.5 + _rise(u - high[:, None], right - mirrored_right, high - low)
     share += _rise(low[:, None] - u, mirrored_left - left, high - low)
     share[high <= low] = 1
-    far = np.where(right > mirrored_right, share[:, -1], 1 - share[:, 0])  # for the values beyond the right edge
-    share = np.column_stack((1 - far, share, far))
-    before, after = (math.ceil(wanted.max() - 1e-6) for wanted in (left - mirrored_left, mirrored_right - right))
-    most = 2 * cols  # if the axis is farther away, the hole in the middle cannot be filled
-    return share, (min(max(0, before), most), min(max(0, after), most))
+    share_beyond_right = np.where(
+        right > mirrored_right, share[:, -1], 1 - share[:, 0]
+    )  # for the values beyond the right edge
+    share = np.column_stack((1 - share_beyond_right, share, share_beyond_right))
+    zeros_before, zeros_after = (
+        math.ceil(wanted.max() - 1e-6) for wanted in (left - mirrored_left, mirrored_right - right)
+    )
+    most_zeros = 2 * cols  # if the axis is farther away, the hole in the middle cannot be filled
+    return share, (min(max(0, zeros_before), most_zeros), min(max(0, zeros_after), most_zeros))
 
 
 def _rise(beyond: F64, excess: F64, overlap: F64) -> F64:
@@ -390,9 +394,9 @@ def _nearest(angles: F64, wanted: F64) -> NDArray[np.intp]:
     """Index of the projection nearest to each wanted angle on the circle."""
     theta, target = np.mod(angles, 2 * np.pi), np.mod(wanted, 2 * np.pi)
     order = np.argsort(theta, kind="stable")
-    around = np.concatenate((theta[order[-1:]] - 2 * np.pi, theta[order], theta[order[:1]] + 2 * np.pi))
-    after = np.clip(np.searchsorted(around, target), 1, around.size - 1)
-    closer = after - (target - around[after - 1] < around[after] - target)
+    extended = np.concatenate((theta[order[-1:]] - 2 * np.pi, theta[order], theta[order[:1]] + 2 * np.pi))
+    following = np.clip(np.searchsorted(extended, target), 1, extended.size - 1)
+    closer = following - (target - extended[following - 1] < extended[following] - target)
     return order[(closer - 1) % theta.size]
 
 

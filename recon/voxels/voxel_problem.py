@@ -30,7 +30,7 @@ from recon.voxels.resolution import ViewResolution
 # left out, because their corrections would be divided by almost zero.
 _LEAST_SUM = 1e-3
 
-_LOOKED_AT = 9  # number of projections of a sweep whose residual is kept
+_KEPT_VIEWS = 9  # number of projections of a sweep whose residual is kept
 
 
 def interleaved(projector: Projector, subsets: int) -> list[NDArray[np.intp]]:
@@ -107,7 +107,7 @@ class Sweeps:
 
 def sampled_views(subsets: int, n_views: int) -> slice:
     """The projections of a subset of `n_views` whose residual is kept, so that a sweep over `subsets` keeps about 9."""
-    return slice(None, None, max(1, subsets * n_views // _LOOKED_AT))
+    return slice(None, None, max(1, subsets * n_views // _KEPT_VIEWS))
 
 
 def whitened(residual: F32, weight: F32 | None) -> F32:
@@ -298,17 +298,19 @@ class Momentum:
         most: largest share of the last step that is added.
     """
 
-    def __init__(self, start: Any, decide: Decisions, device: VoxelDevice[Any] = CPU, most: float = 1.0) -> None:
-        self._decide, self._device, self._most = decide, device, most
+    def __init__(
+        self, start: Any, decide: Decisions, device: VoxelDevice[Any] = CPU, largest_momentum: float = 1.0
+    ) -> None:
+        self._decide, self._device, self._most = decide, device, largest_momentum
         self._last, self._from, self._t = device.copy(start), device.copy(start), 1.0
 
     def __call__(self, x: Any) -> None:
         """Move x from the end of a step to the start of the next step, in place."""
         if self._decide("restart", lambda: self._device.turn_of_steps(self._last, self._from, x) > 0):
             self._t = 1.0
-        after = (1 + math.sqrt(1 + 4 * self._t**2)) / 2
-        self._device.extrapolate(x, min((self._t - 1) / after, self._most), self._last, self._from)
-        self._t = after
+        next_t = (1 + math.sqrt(1 + 4 * self._t**2)) / 2
+        self._device.extrapolate(x, min((self._t - 1) / next_t, self._most), self._last, self._from)
+        self._t = next_t
 
 
 def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:

@@ -275,7 +275,7 @@ def scores_of(slices: Mapping[str, UnseenViews], *, direct: bool = False) -> tup
 
 def shares_of(choice: TrialChoice) -> list[float]:
     """[candidate] the residual in all held-out projections together, as in `recon.judgement`."""
-    return [float(np.sqrt(np.square(residuals).mean())) for residuals in choice.tried.values()]
+    return [float(np.sqrt(np.square(residuals).mean())) for residuals in choice.residuals_by_number.values()]
 
 
 Trials = Sequence[tuple[Mapping[str, str], ReconOptions]]

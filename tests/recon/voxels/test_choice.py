@@ -168,5 +168,5 @@ def test_a_choice_is_the_same_from_a_file() -> None:
     again = TrialChoice.of(json.loads(json.dumps(choice)))
     assert (again.chosen, again.reason) == (choice.chosen, choice.reason)
     assert again.predictions[1].prior == Prior(0.1)
-    assert again.least is not None and again.least.mean() == pytest.approx(1.0)
+    assert again.best_residuals is not None and again.best_residuals.mean() == pytest.approx(1.0)
     assert TrialChoice("no views").chosen is None and TrialChoice("no views").reason == "no views"
