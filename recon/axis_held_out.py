@@ -24,14 +24,15 @@ COLS = 128  # columns; enough to find the axis to 0.05 of their pixels. More tak
 VIEWS = 90  # projections that suffice
 _LEAST_VIEWS = 12
 _ONE_IN = 3  # share of held-out projections: one in three
-_WIDEST = 0.1875  # largest distance of the axis from the start, as a share of the number of columns
+_LARGEST_DISTANCE = 0.1875  # largest distance of the axis from the start, as a share of the number of columns
 _TV_WEIGHT = 3e-3  # every weight that suppresses the noise in the volume gives the same axis
-_WIDER = 2.0  # width of the box for a sample that is wider than the field of view, in fields of view
+_WIDER_BOX = 2.0  # width of the box for a sample that is wider than the field of view, in fields of view
 _STEPS = 8  # largest number of moves of the parabola's middle towards its vertex
-_WHOLE = 0.999  # share of a binned pixel that must have data
+_LEAST_MEASURED_SHARE = 0.999  # share of a binned pixel that must have data
 # factor on the iterations: material that only half of the projections see converges late and shifts the axis
-_SHADOWED = 3
-_CLEAR = 0.1  # share by which the best axis must lower the typical residual for the estimate to be confident
+_SHADOWED_SWEEPS = 3
+# share by which the best axis must lower the typical residual for the estimate to be confident
+_LEAST_IMPROVEMENT = 0.1
 
 
 def axis_by_views(
@@ -74,13 +75,13 @@ def axis_by_views(
     data, known = projections, projections
     if lit is not None:
         data, known = (np.where(lit, projections, np.float32(other)) for other in (0, np.nan))
-    width = _WIDER if reach_of(Views(known, geometry)).edges.beyond(0.0) else 1.0
-    longer = 1 if lit is None else _SHADOWED
-    tried = list[float]()
+    width = _WIDER_BOX if reach_of(Views(known, geometry)).edges.beyond(0.0) else 1.0
+    longer = 1 if lit is None else _SHADOWED_SWEEPS
+    tested_columns = list[float]()
 
     def ask(column: float) -> None:
-        tried.append(column)
-        progress(len(tried))
+        tested_columns.append(column)
+        progress(len(tested_columns))
 
     # 32 columns are enough to come within half a coarse pixel. On fine pixels, a change of the grid would change the
     # residual more than a small step of the axis.
@@ -88,11 +89,11 @@ def axis_by_views(
     fine = _Residuals.of(data, geometry, lit, (COLS, 8), 6 * longer, width, ask)
     best, typical = _coarse_optimum(coarse, geometry)
     fine.grid = fine.grid_about(best)
-    clear, half = coarse(best) < (1 - _CLEAR) * typical, 0.5 * fine.bin
+    clear, half_bin = coarse(best) < (1 - _LEAST_IMPROVEMENT) * typical, 0.5 * fine.bin
     for _ in range(_STEPS):
-        vertex = _vertex(fine, best, half)
-        downhill = min((best - half, best + half), key=fine)
-        if (vertex is not None and abs(vertex - best) <= half) or fine(downhill) >= fine(best):
+        vertex = _vertex(fine, best, half_bin)
+        downhill = min((best - half_bin, best + half_bin), key=fine)
+        if (vertex is not None and abs(vertex - best) <= half_bin) or fine(downhill) >= fine(best):
             break
         best = downhill
     columns = sorted(coarse.found)
@@ -138,7 +139,7 @@ class _Residuals:
             data, geometry = data[:, first : first + height], geometry.rows(first, first + height)
             lit = None if lit is None else lit[..., first : first + height, :]
         if lit is not None:
-            lit = bin_views(np.broadcast_to(lit, data.shape).astype(np.float32), binning) > _WHOLE
+            lit = bin_views(np.broadcast_to(lit, data.shape).astype(np.float32), binning) > _LEAST_MEASURED_SHARE
         binned = bin_views(np.ascontiguousarray(data), binning)
         return cls(binned, geometry.binned(binning), lit, binning, axis_col, sweeps, width, ask)
 
@@ -157,12 +158,12 @@ class _Residuals:
             unseen, images = predicted_views(method, Views(self.data, views, weights), grid, _ONE_IN)
             lit = 1 if self.lit is None else self.lit[unseen]
             measured = self.data[unseen] * lit
-            matter = _norm(measured)
-            if matter == 0:
+            norm_of_views = _norm(measured)
+            if norm_of_views == 0:
                 raise AxisError(
                     "give the rotation axis: it cannot be found, because the held-out projections show no material"
                 )
-            self.found[axis_col] = _norm(measured - images * lit) / matter
+            self.found[axis_col] = _norm(measured - images * lit) / norm_of_views
             self.ask(axis_col)
         return self.found[axis_col]
 
@@ -170,16 +171,16 @@ class _Residuals:
 def _coarse_optimum(residual: _Residuals, geometry: Geometry) -> tuple[float, float]:
     """The best column, accurate to half a coarse pixel, and the median residual of the columns tried."""
     cols, start = geometry.detector_shape[1], geometry.axis_col
-    step = _WIDEST / 3 * cols
+    step = _LARGEST_DISTANCE / 3 * cols
     best = min((start + n * step for n in range(-3, 4)), key=residual)
     typical = float(np.median(list(residual.found.values())))
     while step > 0.5 * residual.bin:
         step /= 2
         best = min((best, best - step, best + step), key=residual)
-    if abs(best - start) > _WIDEST * cols:
+    if abs(best - start) > _LARGEST_DISTANCE * cols:
         raise AxisError(
-            f"give the axis: no rotation axis was found within {_WIDEST * cols:.0f} columns of column {start:.1f}. "
-            f"The held-out projections agree best with column {best:.1f}, at the edge of the search"
+            f"give the axis: no rotation axis was found within {_LARGEST_DISTANCE * cols:.0f} columns of column "
+            f"{start:.1f}. The held-out projections agree best with column {best:.1f}, at the edge of the search"
         )
     return best, typical
 
@@ -188,8 +189,8 @@ def _norm(values: F32) -> float:
     return float(np.linalg.norm(values.astype(np.float64)))
 
 
-def _vertex(residual: _Residuals, middle: float, half: float) -> float | None:
+def _vertex(residual: _Residuals, middle: float, step: float) -> float | None:
     """The vertex of the parabola through three squared residuals; None if the parabola has no minimum."""
-    below, here, above = (residual(middle + n * half) ** 2 for n in (-1, 0, 1))
-    bend = below - 2 * here + above
-    return middle + half * 0.5 * (below - above) / bend if bend > 0 else None
+    square_below, square_middle, square_above = (residual(middle + n * step) ** 2 for n in (-1, 0, 1))
+    bend = square_below - 2 * square_middle + square_above
+    return middle + step * 0.5 * (square_below - square_above) / bend if bend > 0 else None

@@ -28,17 +28,18 @@ from recon.voxels.view_weights import density_gain
 HALO = 8  # smallest number of slices on each side of a slab that its error bars need
 LEAST_VIEWS = 8
 
-_EXTRA = 0.5  # one half of the projections weighs this much more, the other half this much less
-_SHARE = 0.2  # share of a method's iterations in each of the two refits
+_WEIGHT_DIFFERENCE = 0.5  # one half of the projections weighs this much more, the other half this much less
+_REFIT_SHARE = 0.2  # share of a method's iterations in each of the two refits
 # side, in voxels, of the cube over which variances are averaged; the variance from a single voxel is uncertain by a
 # factor of 1.4
 _WINDOW = 7
 # number of classes of the gradient; variances are averaged separately in each, because edges vary more than their
 # surroundings
 _CLASSES = 4
-_EDGE = 0.7  # voxels; standard deviation of the blur before the gradient
-_SAMPLED = 2**20  # number of voxels from which the limits of the classes are computed
-_OF_RUN = ("units", "weight", "balance", "strength", "threshold")  # decisions of the run that a refit uses again
+_EDGE_BLUR = 0.7  # voxels; standard deviation of the blur before the gradient
+_SAMPLED_VOXELS = 2**20  # number of voxels from which the limits of the classes are computed
+# decisions of the run that a refit uses again
+_DECISIONS_OF_RUN = ("units", "weight", "balance", "strength", "threshold")
 # name of a decision that only error bars make; it distinguishes their decisions from those of the run
 _LIMITS = "limits"
 
@@ -135,7 +136,7 @@ def method_on_voxels(method: Method, decided: Mapping[str, Sequence[Any]]) -> Me
         raise ValueError(
             f"error bars of {method.name} need a run with voxel refinement, but this run had no voxel refinement"
         )
-    smooth, patches = (one(allow_negative=method.allow_negative) for one in (FistaTv, PnpDct))
+    smooth, patches = (method_class(allow_negative=method.allow_negative) for method_class in (FistaTv, PnpDct))
     (levels, *_), (_, by_patches) = decided.get("materials", [[()]])[-1], decided.get("strength", [(0.0, 0)])[-1]
     return pull_methods(allow_negative=method.allow_negative)[0] if levels else patches if by_patches else smooth
 
@@ -144,9 +145,12 @@ def error_bars_memory(method: Method, geometry: Geometry, grid: Grid) -> int:
     """Peak memory of `error_bars` in bytes, without the projections, their weights and the volume."""
     rays, voxels = geometry.n_views * math.prod(geometry.detector_shape), math.prod(grid.shape)
     made_by = (FistaTv(), PnpDct(), *pull_methods()) if isinstance(method, Fit) else (method,)
-    refits = [one.refit(_SHARE) if isinstance(one, VoxelMethod) else one for one in made_by]
-    work = max(one.memory(geometry, grid, True) for one in refits)
-    return work + 4 * (2 * rays + 5 * voxels)
+    refits = [
+        each_method.refit(_REFIT_SHARE) if isinstance(each_method, VoxelMethod) else each_method
+        for each_method in made_by
+    ]
+    memory_of_refit = max(each_method.memory(geometry, grid, True) for each_method in refits)
+    return memory_of_refit + 4 * (2 * rays + 5 * voxels)
 
 
 def alternating(geometry: Geometry) -> F32:
@@ -173,10 +177,10 @@ def _refitted(
 ) -> tuple[F32, Mapping[str, Sequence[Any]]] | None:
     """Half the difference of two refits, divided by the extra weight, and the decisions of the refits. None if it was
     stopped."""
-    refit = method.refit(_SHARE)
+    refit = method.refit(_REFIT_SHARE)
     sweeps, begin, done = refit.iterations, control.now(), 0
     follow = decided if _LIMITS in decided else _of_run(decided, sweeps)
-    given = problem.views.masked()
+    known_views = problem.views.masked()
     projector, signs = Projector(problem.geometry, problem.grid), alternating(problem.geometry)[:, None, None]
 
     def progress(iteration: int, residual: float) -> bool:
@@ -188,7 +192,7 @@ def _refitted(
     go_on = GoesOn(progress)
     volumes: list[F32] = []
     for sign in (1, -1):
-        trusted = given.weighed(1 + np.float32(sign * _EXTRA) * signs)
+        trusted = known_views.weighed(1 + np.float32(sign * _WEIGHT_DIFFERENCE) * signs)
         decide = Decisions(problem.seed, follow)
         refitted = solve_views(
             refit, projector, trusted, start=volume, nonnegative=not method.allow_negative, go_on=go_on,
@@ -198,22 +202,22 @@ def _refitted(
             return None
         follow = decide.made
         volumes.append(refitted.data)
-    more, less = volumes
-    more -= less
-    more *= np.float32(0.5 / _EXTRA)
-    return more, follow
+    heavier, lighter = volumes
+    heavier -= lighter
+    heavier *= np.float32(0.5 / _WEIGHT_DIFFERENCE)
+    return heavier, follow
 
 
 def _of_run(decided: Mapping[str, Sequence[Any]], sweeps: int) -> dict[str, list[Any]]:
     """The decisions of a run that refits use again. If a weight changed during the run, the refits use its last
     value."""
-    kept = {name: list(decided[name]) for name in _OF_RUN if name in decided}
-    return {name: sweeps * made[-1:] if name == "balance" else made for name, made in kept.items()}
+    kept = {name: list(decided[name]) for name in _DECISIONS_OF_RUN if name in decided}
+    return {name: sweeps * values[-1:] if name == "balance" else values for name, values in kept.items()}
 
 
 def _gradient(volume: F32) -> F32:
     """The change from voxel to voxel [z, y, x], after a slight blur."""
-    smooth = gaussian_filter(volume, _EDGE)
+    smooth = gaussian_filter(volume, _EDGE_BLUR)
     total = np.zeros_like(smooth)
     for axis, n in enumerate(smooth.shape):
         if n > 1:
@@ -223,7 +227,8 @@ def _gradient(volume: F32) -> F32:
 
 def _limits(gradient: F32, classes: int) -> list[float]:
     return [
-        float(limit) for limit in np.percentile(some_values(gradient, _SAMPLED), np.linspace(0, 100, classes + 1)[1:-1])
+        float(limit)
+        for limit in np.percentile(some_values(gradient, _SAMPLED_VOXELS), np.linspace(0, 100, classes + 1)[1:-1])
     ]
 
 
@@ -234,7 +239,7 @@ def _averaged(squares: F32, gradient: F32, limits: Sequence[float]) -> F32:
     else:
         out, classes = np.empty_like(squares), np.searchsorted(limits, gradient).astype(np.uint8)
         for k in range(len(limits) + 1):
-            here = classes == k
-            total = uniform_filter(np.where(here, squares, np.float32(0)), _WINDOW)
-            np.divide(total, uniform_filter(here.astype(np.float32), _WINDOW), out=out, where=here)
+            in_class = classes == k
+            total = uniform_filter(np.where(in_class, squares, np.float32(0)), _WINDOW)
+            np.divide(total, uniform_filter(in_class.astype(np.float32), _WINDOW), out=out, where=in_class)
     return np.maximum(out, 0, out=out)  # rounding errors of the running sums may be below zero

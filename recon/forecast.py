@@ -134,15 +134,15 @@ class Timing:
         if key not in self._paces:
             part, on_voxels = self._trial if of_trial else self._part, isinstance(method, VoxelMethod)
             first = method.first_sweeps if isinstance(method, VoxelMethod) else 0
-            pace = _timed(method, part, self._now, first + _PATCH_STEPS if first else _ITERATIONS, first)
+            timing = _timed(method, part, self._now, first + _PATCH_STEPS if first else _ITERATIONS, first)
             if isinstance(method, VoxelMethod):
                 further = method.further_sweeps(self._geometry, self._grid)
-                pace = pace._replace(planned=min(pace.planned, method.usual_sweeps) + further)
+                timing = timing._replace(planned=min(timing.planned, method.usual_sweeps) + further)
             scale = _work(self._geometry, self._grid) / _work(part.geometry, part.grid)
             # A step that uses only some projections takes the same time, however many projections there are. Its time
             # grows with the number of samples along a ray.
-            along = max(self._grid.shape) / max(part.grid.shape)
-            self._paces[key] = pace.scaled(scale, scale if on_voxels else along)
+            size_ratio = max(self._grid.shape) / max(part.grid.shape)
+            self._paces[key] = timing.scaled(scale, scale if on_voxels else size_ratio)
         return self._paces[key]
 
     @property
@@ -163,23 +163,23 @@ class Timing:
     def fit_pace(self, method: Fit) -> RunTiming:
         """Expected timing of a fit without its voxel refinement."""
         field = Grid.for_fit(self._geometry, self._grid)
-        given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
+        n_stated = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
         usual = count_for(field, self._geometry.is_cone)
-        count, part = given or usual, self._part
+        count, part = n_stated or usual, self._part
         joined = method.fit.joined_pixels or joined_for(
             field, self._geometry.is_cone, max(count, usual), self._geometry.detector_shape
         )
-        here = count_for(Grid.for_fit(part.geometry, part.grid), part.geometry.is_cone)
-        some, short = max(1, round(here * count / usual)), cast(Any, method)
-        short = replace(short, gaussians=some, finish=0, fit=replace(method.fit, joined_pixels=joined))
+        n_of_part = count_for(Grid.for_fit(part.geometry, part.grid), part.geometry.is_cone)
+        n_trial, short = max(1, round(n_of_part * count / usual)), cast(Any, method)
+        short = replace(short, gaussians=n_trial, finish=0, fit=replace(method.fit, joined_pixels=joined))
         grown = ((1 + growth(method.fit)) / 2) ** (1 / 3)  # Gaussians are added during the fit
-        covers = _covered(math.prod(self._grid.shape), count) / _covered(math.prod(part.grid.shape), some)
+        covers = _covered(math.prod(self._grid.shape), count) / _covered(math.prod(part.grid.shape), n_trial)
         return _timed(short, part, self._now, _FIT_STEPS).scaled(self._scale, grown * covers)
 
     def _of_fit(self, method: Fit) -> Forecast:
-        pace = self.fit_pace(method)
+        timing = self.fit_pace(method)
         if method.finish_sweeps == 0:
-            return Forecast(0.0, {method.name: pace.total})
+            return Forecast(0.0, {method.name: timing.total})
         finish = self._rendered(method) + self._smooth.fixed + method.finish_sweeps * self._smooth.each
         choice = self.trial_seconds(FistaTv() if method.finish is not None else PnpDct())
         if method.finish is None:
@@ -187,7 +187,7 @@ class Timing:
                 sum(each.refused_sweeps for each in pull_methods()) / CHOICE_SWEEPS * self.trial_seconds(FistaTv())
             )
             finish += PnpDct.iterations * self.pace(PnpDct()).each
-        return Forecast(choice, {method.name: pace.total + finish})
+        return Forecast(choice, {method.name: timing.total + finish})
 
     def _rendered(self, method: Fit) -> float:
         """Expected seconds to render all projections of a fit, for its voxel refinement."""
@@ -206,8 +206,8 @@ class Timing:
     def _tried(self, method: Method) -> float:
         """Expected seconds of a method's volume in a test with all rows, without the search for priors."""
         if isinstance(method, Fit) and method.finish is None:
-            pace = self.fit_pace(method)
-            first = pace._replace(planned=round(FIRST_SHARE * pace.planned)).total
+            timing = self.fit_pace(method)
+            first = timing._replace(planned=round(FIRST_SHARE * timing.planned)).total
             return first + self._rendered(method) + FINISH_SWEEPS * self.pace(FistaTv(), of_trial=True).each
         return 0.0 if method.trial_sweeps else self.of(method).most
 
@@ -229,8 +229,8 @@ def part_of(geometry: Geometry, grid: Grid, voxels: int | None, most_rows: int =
     wider = grid.shape[1] / Grid.matching(geometry).shape[1]  # a sample that continues outside the field of view
     nz, ny, nx = box.shape
     box = replace(box, shape=(nz, round(wider * ny), round(wider * nx)))
-    across = np.arange(width) - (width - 1) / 2
-    lines = np.sqrt(np.maximum((0.35 * width) ** 2 - across**2, 0)) / width
+    columns_from_middle = np.arange(width) - (width - 1) / 2
+    lines = np.sqrt(np.maximum((0.35 * width) ** 2 - columns_from_middle**2, 0)) / width
     noise = np.random.default_rng(0).standard_normal((views.n_views, height, width), np.float32)
     data: F32 = lines.astype(np.float32) + _NOISE * noise
     return ReconProblem(Views(data, views), box)
@@ -247,8 +247,8 @@ def _covered(voxels: float, gaussians: float) -> float:
     return float(voxels ** (2 / 3) * gaussians ** (1 / 3))
 
 
-def _timed(method: Method, part: ReconProblem, now: Clock, last: int, after: int = 0) -> RunTiming:
-    """The timing of the iterations from `after` to `last`, without test reconstructions."""
+def _timed(method: Method, part: ReconProblem, now: Clock, last: int, untimed_steps: int = 0) -> RunTiming:
+    """The timing of the iterations from `untimed_steps` to `last`, without test reconstructions."""
     reached: list[tuple[int, float]] = []
     planned = last
 
@@ -262,9 +262,9 @@ def _timed(method: Method, part: ReconProblem, now: Clock, last: int, after: int
     begin = now()
     method.run(part, control)
     seconds = now() - begin
-    some = [mark for mark in reached if mark[0] >= (after + STEPS if after else 1)]
-    if len(some) < 2:
+    timed_marks = [mark for mark in reached if mark[0] >= (untimed_steps + STEPS if untimed_steps else 1)]
+    if len(timed_marks) < 2:
         return RunTiming(0.0, seconds / planned, planned) if planned else RunTiming(seconds, 0.0, 0)
-    (step, at), (end, until) = some[0], some[-1]
-    each = (until - at) / (end - step)
-    return RunTiming(seconds - (end - after) * each, each, planned - after)
+    (step, start_seconds), (end, until) = timed_marks[0], timed_marks[-1]
+    each = (until - start_seconds) / (end - step)
+    return RunTiming(seconds - (end - untimed_steps) * each, each, planned - untimed_steps)

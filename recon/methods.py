@@ -141,8 +141,8 @@ def build(method: type[Method], settings: Mapping[str, Any]) -> Method:
             if not (owners := ", ".join(taking(name))):
                 raise ValueError(unknown(f"setting of {method.name}", name, setting_names(method())))
             raise ValueError(f"method {method.name!r} has no setting {name!r}; these methods have it: {owners}")
-    found: Method = with_settings(method(), settings)
-    return found
+    built: Method = with_settings(method(), settings)
+    return built
 
 
 def with_settings(method: Any, settings: Mapping[str, Any]) -> Any:

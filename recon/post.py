@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F64
 
-_CLUSTERED = 20_000  # number of values from which the centres are computed
+_SAMPLED_VALUES = 20_000  # number of values from which the centres are computed
 _STARTS = 8
 MOST = 6
 
@@ -59,8 +59,8 @@ def clusters(values: NDArray[np.floating], k: int | None = None, seed: int = 0) 
     sample = _sampled(values, seed)
     inertias = np.empty(0)
     if k is None:
-        most = min(MOST, np.unique(sample).size)
-        inertias = np.array([_fitted(sample, n, seed)[1] for n in range(1, most + 1)])
+        most_levels = min(MOST, np.unique(sample).size)
+        inertias = np.array([_fitted(sample, n, seed)[1] for n in range(1, most_levels + 1)])
         k = elbow(inertias)
     centres, _ = _fitted(sample, k, seed)
     counts = np.bincount(np.searchsorted((centres[1:] + centres[:-1]) / 2, sample), minlength=k)
@@ -81,8 +81,8 @@ def elbow(inertias: F64) -> int:
 
 def _sampled(values: NDArray[np.floating], seed: int) -> F64:
     flat = np.asarray(values).ravel()
-    if flat.size > _CLUSTERED:
-        flat = np.random.default_rng(seed).choice(flat, _CLUSTERED, replace=False)
+    if flat.size > _SAMPLED_VALUES:
+        flat = np.random.default_rng(seed).choice(flat, _SAMPLED_VALUES, replace=False)
     if not np.isfinite(flat).all():
         raise ValueError("some grey values are not finite")
     return flat.astype(np.float64)

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 # number of values in the sample; largest line integral (measured ones end at about 15)
-_LOOKED_AT, _LARGEST = 2**16, 1e15
+_SAMPLED_VALUES, _LARGEST_LINE_INTEGRAL = 2**16, 1e15
 
 
 def reconstruct(
@@ -105,15 +105,15 @@ def reconstruct(
     begin = control.now()
     problem = ReconProblem(views, grid or Grid.matching(geometry), use, int(seed), device)
     result = run_on_extended_grid(chosen, problem, control)
-    by, seconds = result.method or chosen.name, result.seconds or control.now() - begin
-    return replace(result, settings=dict(result.settings), method=by, seconds=seconds)
+    method_name, seconds = result.method or chosen.name, result.seconds or control.now() - begin
+    return replace(result, settings=dict(result.settings), method=method_name, seconds=seconds)
 
 
 def _warn_of_unknown(data: NDArray[np.float32], weights: Any) -> None:
     """Warn if values are not finite, except those with weight 0."""
     lost = sum(
-        int((~np.isfinite(view) & (True if weights is None else np.asarray(weights[at] > 0))).sum())
-        for at, view in enumerate(data)
+        int((~np.isfinite(view) & (True if weights is None else np.asarray(weights[number] > 0))).sum())
+        for number, view in enumerate(data)
         if not np.isfinite(view).all()
     )
     if 0 < lost < data.size:
@@ -125,13 +125,13 @@ def _warn_of_unknown(data: NDArray[np.float32], weights: Any) -> None:
 
 
 def _warn_of_negative(data: NDArray[np.float32]) -> None:
-    some = data[:: max(1, len(data) // 16)]
-    some = some[np.isfinite(some)]
-    if some.sum(dtype=np.float64) < -np.abs(some).sum(dtype=np.float64) / 2:
+    sampled = data[:: max(1, len(data) // 16)]
+    sampled = sampled[np.isfinite(sampled)]
+    if sampled.sum(dtype=np.float64) < -np.abs(sampled).sum(dtype=np.float64) / 2:
         warnings.warn(
             "change the sign of the projections: most of their values are below 0 (mean "
-            f"{some.mean(dtype=np.float64):.4g}), but line integrals of material, -log of the transmission, are above "
-            "0. If the projections are differences, set allow_negative in methods that clip voxels at 0",
+            f"{sampled.mean(dtype=np.float64):.4g}), but line integrals of material, -log of the transmission, are "
+            "above 0. If the projections are differences, set allow_negative in methods that clip voxels at 0",
             stacklevel=3,
         )
 
@@ -169,13 +169,13 @@ def _warn_of_half_acquisition(views: Views) -> None:
     geometry = views.geometry
     if not geometry.is_off_middle or covers_the_circle(geometry.angles):
         return
-    left, right = geometry.axis_col + 0.5, geometry.detector_shape[1] - 0.5 - geometry.axis_col
-    if ("left" if left < right else "right") in reach_of(views).beyond:
+    columns_left, columns_right = geometry.axis_col + 0.5, geometry.detector_shape[1] - 0.5 - geometry.axis_col
+    if ("left" if columns_left < columns_right else "right") in reach_of(views).beyond:
         warnings.warn(
             "take projections over 360 degrees without a gap, or do not rely on the densities: the sample reaches "
-            f"beyond the edge of the detector that is {min(left, right):.0f} columns from the rotation axis, and only "
-            "a full circle shows all rays that are farther from the axis. Without a full circle, densities in our "
-            "tests were too low: by up to a third with FBP, by up to an eighth with iterative methods "
+            f"beyond the edge of the detector that is {min(columns_left, columns_right):.0f} columns from the rotation "
+            "axis, and only a full circle shows all rays that are farther from the axis. Without a full circle, "
+            "densities in our tests were too low: by up to a third with FBP, by up to an eighth with iterative methods "
             "(docs/numerics.md)",
             stacklevel=3,
         )
@@ -185,8 +185,8 @@ def _refuse_geometry(geometry: Geometry) -> None:
     """Raise ValueError if all projections are from one side, or if the axis is outside the detector."""
     # Parallel projections 180° apart contain the same rays, so |sin| of the angle between two shows whether they
     # differ. Projections of a cone, and those with a tilt along the beam, differ up to 360°.
-    turn = (geometry.angles - geometry.angles[0]) / (2 if geometry.is_cone or geometry.tilt.any() else 1)
-    if np.abs(np.sin(turn)).max() < 1e-6:
+    angle_from_first = (geometry.angles - geometry.angles[0]) / (2 if geometry.is_cone or geometry.tilt.any() else 1)
+    if np.abs(np.sin(angle_from_first)).max() < 1e-6:
         raise ValueError(
             "give projections at two or more different angles, because one direction does not determine a volume; "
             f"got {geometry.n_views} from one side ({np.rad2deg(geometry.angles[0]):g} degrees)"
@@ -204,9 +204,13 @@ def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunContr
         "resume": ("checkpoints", control.resume is not None),
         "on_checkpoint": ("checkpoints", control.on_checkpoint is not None),
     }
-    foreign = [(what, taken) for what, (taken, given) in wanted.items() if given and taken not in method.takes]
+    foreign = [
+        (argument, capability)
+        for argument, (capability, is_given) in wanted.items()
+        if is_given and capability not in method.takes
+    ]
     if foreign:
-        owners = ", ".join(f"{what} (of {', '.join(accepting(taken))})" for what, taken in foreign)
+        owners = ", ".join(f"{argument} (of {', '.join(accepting(capability))})" for argument, capability in foreign)
         raise ValueError(
             f"method {method.name!r} has no option {owners}: leave the option out, or choose another method"
         )
@@ -215,13 +219,13 @@ def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunContr
 def _views(projections: ArrayLike | Tensor | Counts | Views, geometry: Geometry | None, use: DataUse) -> Views:
     """Line integrals with their weights and their geometry, as far as it can be used."""
     if isinstance(projections, Views):
-        given = {
+        arguments = {
             "geometry": geometry is not None,
             "use.weights": use.weights is not None,
             "use.held_out": len(use.held_out) > 0,
             "use.sample_radius": use.sample_radius is not None,
         }
-        if twice := [name for name, is_given in given.items() if is_given]:
+        if twice := [name for name, is_given in arguments.items() if is_given]:
             raise ValueError(
                 f"leave out {' and '.join(twice)}, because the projections are given as Views, which contain this "
                 "information"
@@ -244,18 +248,18 @@ def _views(projections: ArrayLike | Tensor | Counts | Views, geometry: Geometry 
 
 
 def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.float32]:
-    given = np.asarray(projections.detach() if hasattr(projections, "detach") else projections)  # a tensor
-    if given.dtype.kind not in "fiub":
-        raise ValueError(f"projections must be real numbers, got {given.dtype}")
-    require_views(geometry, given)
+    array = np.asarray(projections.detach() if hasattr(projections, "detach") else projections)  # a tensor
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"projections must be real numbers, got {array.dtype}")
+    require_views(geometry, array)
     with np.errstate(over="ignore"):  # values outside the range of float32 count as not finite
-        data = np.ascontiguousarray(given, np.float32)
-    some = np.abs(some_values(data, _LOOKED_AT))
-    some = some[np.isfinite(some)]
-    if some.size and (most := float(np.quantile(some, 0.9))) > _LARGEST:
+        data = np.ascontiguousarray(array, np.float32)
+    sampled = np.abs(some_values(data, _SAMPLED_VALUES))
+    sampled = sampled[np.isfinite(sampled)]
+    if sampled.size and (largest := float(np.quantile(sampled, 0.9))) > _LARGEST_LINE_INTEGRAL:
         raise ValueError(
             "divide the line integrals by a constant; the volume is then divided by the same constant. One in ten "
-            f"line integrals is above {most:.3g}. Line integrals up to {_LARGEST:g} are possible, because the sums "
-            "of squares of larger values exceed the range of float32"
+            f"line integrals is above {largest:.3g}. Line integrals up to {_LARGEST_LINE_INTEGRAL:g} are possible, "
+            "because the sums of squares of larger values exceed the range of float32"
         )
     return data

@@ -64,12 +64,12 @@ def warm_up(
             geometry
         )  # with this geometry, an error states the missing degrees of the later run, not those of the example
     data, views = toy_of(geometry, _SEVERAL if isinstance(method, Series) else 1)
-    where = str([value.tolist() for value in arrays_of(views).values()])
+    stated_key = str([value.tolist() for value in arrays_of(views).values()])
     with counted(on_kernel or (lambda n: None)):
         # A fit may end with PnP-DCT steps.
         for warmed in (method, by_name("pnp-dct")()) if isinstance(method, Fit) else (method,):
             toy = warmed.toy()
-            if (key := (type(toy), repr(toy), where, device, weighted)) not in _RECONSTRUCTED:
+            if (key := (type(toy), repr(toy), stated_key, device, weighted)) not in _RECONSTRUCTED:
                 _reconstruct_silently(toy, data, views, device, weighted)
                 _RECONSTRUCTED.add(key)
         if geometry is not None and is_gridded(geometry, Grid.matching(geometry), "hann"):
@@ -112,16 +112,16 @@ def toy_of(geometry: Geometry | None = None, times: int = 1) -> tuple[F32, Geome
     The four projections have the same beam, roll, tilt and shifts as `geometry`. They cover 360° if `geometry` does.
     The four projections are repeated `times` times.
     """
-    once = views = _views_like(geometry)
+    one_turn = views = _views_like(geometry)
     for _ in range(times - 1):
-        views = views.followed_by(once)
-    width, density = _blob(once)
-    rows, cols = (np.arange(n) for n in once.detector_shape)
-    col, row = np.array([once.origin(view) for view in range(once.n_views)]).T[:, :, None]
-    u, v = (cols - col) * once.pixel_pitch, (rows - row) * once.pixel_pitch
+        views = views.followed_by(one_turn)
+    width, density = _blob(one_turn)
+    rows, cols = (np.arange(n) for n in one_turn.detector_shape)
+    col, row = np.array([one_turn.origin(view) for view in range(one_turn.n_views)]).T[:, :, None]
+    u, v = (cols - col) * one_turn.pixel_pitch, (rows - row) * one_turn.pixel_pitch
     from_axis = u[:, None, :] ** 2 + v[:, :, None] ** 2  # mm² at the point where the ray meets the detector
-    if once.is_cone:  # mm² at the point where the ray passes the origin
-        from_axis *= once.sod**2 / (once.sdd**2 + from_axis)
+    if one_turn.is_cone:  # mm² at the point where the ray passes the origin
+        from_axis *= one_turn.sod**2 / (one_turn.sdd**2 + from_axis)
     lines = density * width * np.sqrt(2 * np.pi) * np.exp(-from_axis / (2 * width**2))
     return np.tile(lines.astype(np.float32), (times, 1, 1)), views
 
@@ -130,9 +130,9 @@ def _views_like(geometry: Geometry | None) -> Geometry:
     if geometry is None or not geometry.is_cone:
         views = Geometry.parallel(np.linspace(0, np.pi, _VIEWS, endpoint=False), _SHAPE)
     else:
-        turn = 2 * np.pi if missing_arc(geometry) == 0 else np.pi
+        arc = 2 * np.pi if missing_arc(geometry) == 0 else np.pi
         pitch = geometry.pixel_pitch * geometry.detector_shape[1] / _SHAPE[1]  # the same field of view
-        angles = np.linspace(0, turn, _VIEWS, endpoint=False)
+        angles = np.linspace(0, arc, _VIEWS, endpoint=False)
         views = Geometry.cone(angles, _SHAPE, pitch, geometry.sod, geometry.sdd)
     if geometry is not None:
         leaning = (geometry.roll != 0) | (geometry.tilt != 0) | geometry.centres.any(axis=1)

@@ -44,7 +44,7 @@ from recon.base.arrays import F64
 from recon.prep import correct, counts_plan
 from recon.prep.correct import Plan
 from recon.prep.counts import Photons
-from recon.prep.counts_plan import CorrectionPlan, CorrectionSettings, UnlitViewsError
+from recon.prep.counts_plan import CorrectionPlan, CorrectionSettings, ViewsWithoutBeamError
 from recon.prep.lines_plan import LinesPlan
 from recon.prep.projections import Projections, merge_and_empty
 from recon.prep.references import References
@@ -208,7 +208,7 @@ def as_data_error(plan: ScanCorrectionPlan) -> Iterator[None]:
     """Turn a ValueError about the numbers into a DataError that names the file."""
     try:
         yield
-    except UnlitViewsError as error:
+    except ViewsWithoutBeamError as error:
         judged = plan.scan.selection.step(Preparation).judged
         advice = "" if judged else " (--flags judge leaves out frames that the monitor finds dark)"
         raise DataError(

@@ -10,11 +10,11 @@ from scipy import ndimage
 
 _WINDOW, _SIGMA = 11, 1.5
 _SAMPLE = 100_000  # number of voxels from which the two cluster centres are computed
-_BLURRED = 1.0  # blur of a reference in voxels, so that its noise does not decide which voxels are dense
+_REFERENCE_BLUR = 1.0  # blur of a reference in voxels, so that its noise does not decide which voxels are dense
 _SLAB = 32  # number of slices at a time
-_MOST = 2**21  # largest number of voxels from which regions and their noise are computed
+_MOST_VOXELS = 2**21  # largest number of voxels from which regions and their noise are computed
 SUMMED_VALUES = 2**22  # number of values whose errors are summed at a time
-_RIM = 2  # width in voxels of the rim of a region, into which the surroundings are blurred
+_RIM_WIDTH = 2  # width in voxels of the rim of a region, into which the surroundings are blurred
 
 Array = NDArray[np.floating]
 
@@ -159,7 +159,7 @@ def ssim_of_whole_slices(truth: Array, volume: Array) -> float:
 def sampled(volume: Array) -> Array:
     """Every k-th voxel along each axis (a numpy view), so that at most 2^21 voxels remain."""
     steps = [1, 1, 1]
-    while np.prod([-(-n // step) for n, step in zip(volume.shape, steps, strict=True)]) > _MOST:
+    while np.prod([-(-n // step) for n, step in zip(volume.shape, steps, strict=True)]) > _MOST_VOXELS:
         steps[int(np.argmax(np.divide(volume.shape, steps)))] += 1
     return volume[:: steps[0], :: steps[1], :: steps[2]]
 
@@ -203,8 +203,8 @@ def kmeans_mask(volume: Array, seed: int = 0) -> NDArray[np.int8]:
     if not np.isfinite(values).all():
         raise ValueError("the volume contains NaN or infinite values")
     rng = np.random.default_rng(seed)
-    some = tuple(rng.integers(0, n, _SAMPLE) for n in values.shape) if values.size > _SAMPLE else ...
-    sample = np.asarray(values[some], np.float64).ravel()
+    sampled = tuple(rng.integers(0, n, _SAMPLE) for n in values.shape) if values.size > _SAMPLE else ...
+    sample = np.asarray(values[sampled], np.float64).ravel()
     if np.ptp(sample) == 0:
         raise ValueError(
             f"all voxels have the value {sample[0]:g}, so there are no two regions that a threshold could separate"
@@ -220,10 +220,10 @@ def _between_two_means(values: NDArray[np.float64]) -> float:
     threshold is the middle between the means of the two parts."""
     rising = np.sort(values)
     lower = np.arange(1, rising.size)  # number of values in the lower part, for each possible threshold
-    below = np.cumsum(rising)[:-1] / lower
-    above = (rising.sum() - below * lower) / (rising.size - lower)
-    best = int(np.argmax(lower * (rising.size - lower) * (above - below) ** 2))
-    return float(below[best] + above[best]) / 2
+    mean_below = np.cumsum(rising)[:-1] / lower
+    mean_above = (rising.sum() - mean_below * lower) / (rising.size - lower)
+    best = int(np.argmax(lower * (rising.size - lower) * (mean_above - mean_below) ** 2))
+    return float(mean_below[best] + mean_above[best]) / 2
 
 
 def interior_regions(reference: Array, seed: int = 0) -> NDArray[np.int8] | None:
@@ -244,11 +244,11 @@ def interior_regions(reference: Array, seed: int = 0) -> NDArray[np.int8] | None
         contrast.
     """
     try:
-        mask = kmeans_mask(ndimage.gaussian_filter(np.asarray(reference, np.float32), _BLURRED), seed)
+        mask = kmeans_mask(ndimage.gaussian_filter(np.asarray(reference, np.float32), _REFERENCE_BLUR), seed)
     except ValueError:
         return None
     cross = ndimage.generate_binary_structure(3, 1)
-    for rim in range(_RIM, 0, -1):
+    for rim in range(_RIM_WIDTH, 0, -1):
         inner = np.full(mask.shape, -1, np.int8)
         for kind in (0, 1):
             # The border of the cuboid does not count as an edge of a region.

@@ -73,5 +73,5 @@ class ErrorLaw:
             error_ratio = gaps_and_noise * (1 + views / self.n_views) ** (-factor * self.exponent) + offset
             return -10 * math.log10(error_ratio) or 0.0  # never -0.0
 
-        above = min(2 * self.exponent_error / self.exponent, 1.0) if self.exponent else 1.0
-        return Gain(decibels(1.0), decibels(1 - min(above, BELOW)), decibels(1 + above))
+        relative_error = min(2 * self.exponent_error / self.exponent, 1.0) if self.exponent else 1.0
+        return Gain(decibels(1.0), decibels(1 - min(relative_error, BELOW)), decibels(1 + relative_error))

@@ -16,13 +16,13 @@ from recon.base.arrays import F64, some_values
 _SAMPLE = 200_000  # number of values in the sample
 # share of the variance that two classes must explain; the two halves of one normal distribution explain 0.64
 _SPLIT = 0.7
-_LEAST = 2e-4  # smallest share of the values in a class
-_MOST = 8  # classes
+_LEAST_CLASS_SHARE = 2e-4  # smallest share of the values in a class
+_MOST_CLASSES = 8  # classes
 _FREQUENT = 0.03  # share of all voxels that are not air
 # A class that is this many times as dense as the class below it, and this many times rarer, is shown white. Otherwise
 # the class below would appear black.
 _METAL, _RARER = 4.0, 0.75
-_WEAK = 0.6  # share of the upper end of the material window
+_WEAK_SHARE = 0.6  # share of the upper end of the material window
 _BEYOND = 0.1  # share of the window, added below air and above the densest class shown
 _DARKER, _BRIGHTER = 2.0, 98.0  # percentiles of a class that still belong to the window
 _ALL = (0.05, 99.95)
@@ -36,12 +36,12 @@ def class_levels(values: NDArray[np.floating]) -> list[NDArray[np.floating]]:
     """
     flat = np.sort(some_values(np.asarray(values), _SAMPLE))
     flat = flat[np.isfinite(flat)].astype(np.float64)
-    least = max(4, round(_LEAST * flat.size))
+    least = max(4, round(_LEAST_CLASS_SHARE * flat.size))
     classes, splits = [flat], [_split(flat, least)]
-    while len(classes) < _MOST and max(gain for gain, _ in splits) > 0:
+    while len(classes) < _MOST_CLASSES and max(gain for gain, _ in splits) > 0:
         best = max(range(len(splits)), key=lambda k: splits[k][0])
-        place = splits[best][1]
-        parts = [classes[best][:place], classes[best][place:]]
+        split_index = splits[best][1]
+        parts = [classes[best][:split_index], classes[best][split_index:]]
         classes[best : best + 1], splits[best : best + 1] = parts, [_split(part, least) for part in parts]
     return classes
 
@@ -50,15 +50,15 @@ def _split(ascending: NDArray[np.float64], least: int) -> tuple[float, int]:
     """The sum of squares that a division into two classes explains, and the number of values in the lower class (0: no
     division)."""
     n = ascending.size
-    places = least + np.flatnonzero(ascending[least : n - least + 1] > ascending[least - 1 : n - least])
-    if n < 2 * least or not places.size:
+    candidates = least + np.flatnonzero(ascending[least : n - least + 1] > ascending[least - 1 : n - least])
+    if n < 2 * least or not candidates.size:
         return 0.0, 0
     centred = ascending - ascending.mean()
-    lower = np.cumsum(centred)[places - 1]
-    between = lower**2 / places + lower**2 / (n - places)  # the sum of all is 0
-    best = int(between.argmax())
-    gain = float(between[best])
-    return (gain, int(places[best])) if gain > _SPLIT * float(centred @ centred) else (0.0, 0)
+    lower = np.cumsum(centred)[candidates - 1]
+    variance_between = lower**2 / candidates + lower**2 / (n - candidates)  # the sum of all is 0
+    best = int(variance_between.argmax())
+    gain = float(variance_between[best])
+    return (gain, int(candidates[best])) if gain > _SPLIT * float(centred @ centred) else (0.0, 0)
 
 
 def grey_windows(values: NDArray[np.floating]) -> dict[str, tuple[float, float]]:
@@ -72,10 +72,10 @@ def grey_windows(values: NDArray[np.floating]) -> dict[str, tuple[float, float]]
     if not classes:
         return {"matter": (0.0, 1.0), "all": (0.0, 1.0)}
     frequent = _FREQUENT * sum(each.size for each in classes[1:])  # rarer classes are edges between materials
-    materials = [each for at, each in enumerate(classes) if at == 0 or each.size >= frequent]
+    materials = [each for number, each in enumerate(classes) if number == 0 or each.size >= frequent]
     levels, sizes = [float(np.median(each)) for each in materials], [each.size for each in materials]
-    far = len(levels) > 2 and levels[-1] - levels[0] > _METAL * (levels[-2] - levels[0])
-    top = len(levels) - 1 - (far and sizes[-1] < _RARER * sum(sizes[1:-1]))
+    has_metal = len(levels) > 2 and levels[-1] - levels[0] > _METAL * (levels[-2] - levels[0])
+    top = len(levels) - 1 - (has_metal and sizes[-1] < _RARER * sum(sizes[1:-1]))
 
     def window(top: int) -> tuple[float, float]:
         low, high = float(np.percentile(materials[0], _DARKER)), float(np.percentile(materials[top], _BRIGHTER))
@@ -84,7 +84,7 @@ def grey_windows(values: NDArray[np.floating]) -> dict[str, tuple[float, float]]
         return apart(low, high + _BEYOND * (high - levels[top]))
 
     windows, rare = {"matter": window(top)}, sum(map(len, classes[1:])) < _FREQUENT * sum(map(len, classes))
-    if (top > 1 or rare) and (weak := window(0 if rare else 1))[1] < _WEAK * windows["matter"][1]:
+    if (top > 1 or rare) and (weak := window(0 if rare else 1))[1] < _WEAK_SHARE * windows["matter"][1]:
         windows["weak"] = weak
     low, high = np.percentile(np.concatenate(classes), _ALL).tolist()
     return windows | {"all": apart(low, high)}
@@ -135,10 +135,10 @@ def middle_slices(data: NDArray[np.float32]) -> tuple[U8, tuple[float, float]]:
     parts = [np.asarray(part, np.float64) for part in slices]
     low, high = material_window(np.concatenate([part[np.isfinite(part)] for part in parts]))
     sheet = np.full((max(len(part) for part in parts), sum(part.shape[1] for part in parts) + 2 * _GAP), 255, np.uint8)
-    left = 0
+    first_column = 0
     for part in parts:
-        sheet[: len(part), left : left + part.shape[1]] = _within(part, low, high)
-        left += part.shape[1] + _GAP
+        sheet[: len(part), first_column : first_column + part.shape[1]] = _within(part, low, high)
+        first_column += part.shape[1] + _GAP
     return sheet, (low, high)
 
 
@@ -167,11 +167,11 @@ def fan(angles: NDArray[np.float64], centre: float) -> U8:
         angles: [view] radians.
         centre: position of the axis on the detector, 0 at its left edge, 1 at its right edge; drawn below.
     """
-    half, side = _SIDE // 4, _SIDE // 2
+    radius, side = _SIDE // 4, _SIDE // 2
     sheet = np.full((side + 12, side), 255, np.uint8)
-    away = np.linspace(0.25, 0.95, side) * (half - 1)
-    rows = np.rint(half + np.cos(angles)[:, None] * away).astype(int)
-    cols = np.rint(half - np.sin(angles)[:, None] * away).astype(int)
+    distances = np.linspace(0.25, 0.95, side) * (radius - 1)
+    rows = np.rint(radius + np.cos(angles)[:, None] * distances).astype(int)
+    cols = np.rint(radius - np.sin(angles)[:, None] * distances).astype(int)
     sheet[rows, cols] = 60
     sheet[side + 4 : side + 8] = 190
     if 0 <= centre <= 1:

@@ -14,13 +14,13 @@ from recon.base.arrays import F32, median_deviation, some_values
 from recon.base.geometry import Geometry
 
 NOISE_VIEWS = 16  # number of projections from which the noise is measured
-_LOW, _HIGH = 3, 4  # orders of the differences; the higher order contains finer structure
+_LOW_ORDER, _HIGH_ORDER = 3, 4  # orders of the differences; the higher order contains finer structure
 _LARGEST_BLUR = 1.5  # largest width of a blur in pixels
 _BOW_TIE_ROWS, _BOW_TIE_BINS, _LEAST_POWERS = 32, 16, 200
-_EVEN = 0.02  # tolerance of the angles, as a share of the step between projections
+_ANGLE_TOLERANCE = 0.02  # tolerance of the angles, as a share of the step between projections
 # number of values and of bins of a histogram; smallest height of a peak, as a share of the highest
 _SAMPLED, _BINS, _PEAK = 2**20, 400, 0.1
-_CLIPPED, _ROUNDS = 4.0, 20  # clipping limit in standard deviations of air; largest number of rounds
+_CLIPPING_SIGMAS, _ROUNDS = 4.0, 20  # clipping limit in standard deviations of air; largest number of rounds
 _GROWTH = 4.0  # largest standard deviation of air, divided by that of the values below its most frequent value
 
 
@@ -46,15 +46,15 @@ def noise_level(images: F32) -> float:
     Returns:
         The standard deviation; 0 if no axis is used.
     """
-    some = images[:: max(1, len(images) // NOISE_VIEWS)][:NOISE_VIEWS]
-    axes = _long_axes(some)
-    low, high = _differences(some, axes, _LOW), _differences(some, axes, _HIGH)
+    sampled = images[:: max(1, len(images) // NOISE_VIEWS)][:NOISE_VIEWS]
+    axes = _long_axes(sampled)
+    low, high = _differences(sampled, axes, _LOW_ORDER), _differences(sampled, axes, _HIGH_ORDER)
     if low == 0:
         return 0.0
     ratios, gains = _blurs()
-    by_chance = 2 / math.sqrt(some.size)  # tolerance: white noise has a ratio of 1 within this
-    at = int(np.searchsorted(-ratios, -min((high / low + by_chance) ** (2 / len(axes)), 1.0)))
-    return low * float(gains[min(at, gains.size - 1)]) ** (len(axes) / 2)
+    by_chance = 2 / math.sqrt(sampled.size)  # tolerance: white noise has a ratio of 1 within this
+    first = int(np.searchsorted(-ratios, -min((high / low + by_chance) ** (2 / len(axes)), 1.0)))
+    return low * float(gains[min(first, gains.size - 1)]) ** (len(axes) / 2)
 
 
 def deviation_between_neighbours(values: NDArray[np.floating[Any]], order: int = 1, axis: int = -1) -> float:
@@ -116,11 +116,13 @@ def _beyond_the_bow_tie(lines: F32, geometry: Geometry) -> float:
     count = len(spectrum)
     power = np.abs(np.fft.fft(spectrum, axis=0)) ** 2 / (count * (window**2).sum())
     reach = half + 0.5 + float(np.ptp(axis))
-    off = reach * geometry.sample_pitch / geometry.sod
-    bound = reach / (1 - off) * (omega + 4 * np.pi / chosen.size) + 2 if off < 1 else np.full(bins.size, np.inf)
+    distance = reach * geometry.sample_pitch / geometry.sod
+    bound = (
+        reach / (1 - distance) * (omega + 4 * np.pi / chosen.size) + 2 if distance < 1 else np.full(bins.size, np.inf)
+    )
     free = np.abs(np.fft.fftfreq(count) * count)[:, None] > bound
-    few = power[free]
-    return math.sqrt(float(few.mean())) if few.size >= _LEAST_POWERS else math.inf
+    sampled = power[free]
+    return math.sqrt(float(sampled.mean())) if sampled.size >= _LEAST_POWERS else math.inf
 
 
 def _evenly_spread(geometry: Geometry) -> NDArray[np.intp] | None:
@@ -130,11 +132,11 @@ def _evenly_spread(geometry: Geometry) -> NDArray[np.intp] | None:
     gaps = np.diff(theta[order], append=theta[order[0]] + 2 * np.pi)
     order = np.roll(order, -1 - int(np.argmax(gaps)))  # start after the widest gap
     steps = np.mod(np.diff(theta[order]), 2 * np.pi)
-    if steps.size < 3 or np.ptp(steps) > _EVEN * steps.mean():
+    if steps.size < 3 or np.ptp(steps) > _ANGLE_TOLERANCE * steps.mean():
         return None
     for period in (2 * np.pi,) if geometry.is_cone else (np.pi, 2 * np.pi):
         for views in (order.size, order.size - 1):  # the last projection of the turn may repeat the first one
-            if abs(views * steps.mean() - period) < _EVEN * period / views:
+            if abs(views * steps.mean() - period) < _ANGLE_TOLERANCE * period / views:
                 return order[:views]
     return None
 
@@ -155,15 +157,15 @@ def air_level(values: F32) -> tuple[float, float]:
     least = _PEAK * smooth.max()
     first_peak = _first_peak(smooth, least, least / 2)
     level = float(edges[first_peak - 1] + edges[first_peak]) / 2
-    below = level - values[values < level]
-    first = noise = median_deviation(below)
+    depths = level - values[values < level]
+    first = noise = median_deviation(depths)
     for _ in range(_ROUNDS):
-        near = values[np.abs(values - level) <= _CLIPPED * noise]
-        if not near.size:  # all lower values are equal
+        near_level = values[np.abs(values - level) <= _CLIPPING_SIGMAS * noise]
+        if not near_level.size:  # all lower values are equal
             break
-        before, level = (level, noise), float(np.median(near))
-        noise = min(median_deviation(near - level), _GROWTH * first)
-        if (level, noise) == before:
+        last_values, level = (level, noise), float(np.median(near_level))
+        noise = min(median_deviation(near_level - level), _GROWTH * first)
+        if (level, noise) == last_values:
             break
     return level, noise
 
@@ -195,7 +197,7 @@ def _long_axes(images: F32) -> list[int]:
     """Axes along which five successive pixels are valid, even after differences were taken along the previous axes."""
     field, axes = images, list[int]()
     for axis in (1, 2):
-        further = np.diff(field, _HIGH, axis=axis)
+        further = np.diff(field, _HIGH_ORDER, axis=axis)
         if np.isfinite(further).any():
             field = further
             axes.append(axis)
@@ -218,13 +220,14 @@ def _differences(images: F32, axes: list[int], order: int) -> float:
 
 @cache
 def _blurs() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """For Gaussian blurs of rising width: the variance of differences of order `_HIGH`, and the variance of the pixels
-    themselves, each divided by the variance of differences of order `_LOW`.
+    """For Gaussian blurs of rising width: the variance of differences of order `_HIGH_ORDER`, and the variance of the
+    pixels themselves, each divided by the variance of differences of order `_LOW_ORDER`.
     """
     widths = np.linspace(0, _LARGEST_BLUR, 301)
     f = (np.arange(4096) + 0.5) / 8192  # cycles a pixel
     passed = np.exp(-((2 * np.pi * widths[:, None] * f) ** 2))
     low, high = (
-        (passed * (2 * np.sin(np.pi * f)) ** (2 * n)).mean(axis=1) / math.comb(2 * n, n) for n in (_LOW, _HIGH)
+        (passed * (2 * np.sin(np.pi * f)) ** (2 * n)).mean(axis=1) / math.comb(2 * n, n)
+        for n in (_LOW_ORDER, _HIGH_ORDER)
     )
     return high / low, passed.mean(axis=1) / low

@@ -41,9 +41,10 @@ def placed_views(
         TypeError: a keyword that `Where` does not have.
         ValueError: there are no angles, the detector is empty, the pitch is not positive, or a value is not finite.
     """
-    if unknown := where.keys() - Where.__annotations__.keys():
+    if unknown_names := where.keys() - Where.__annotations__.keys():
         raise TypeError(
-            f"unknown geometry arguments: {', '.join(sorted(unknown))}; known are {', '.join(Where.__annotations__)}"
+            f"unknown geometry arguments: {', '.join(sorted(unknown_names))}; known are "
+            f"{', '.join(Where.__annotations__)}"
         )
     check_arguments(Where, where)
     axis_col, axis_row, shifts = where.get("axis_col"), where.get("axis_row"), where.get("shifts")
@@ -58,15 +59,15 @@ def placed_views(
     for name, value in (("axis_col", col), ("axis_row", row)):
         if not np.isfinite(value):
             raise ValueError(f"{name} must be finite, got {value}")
-    moved = np.zeros((theta.size, 2)) if shifts is None else np.asarray(shifts, np.float64)
-    if moved.shape != (theta.size, 2) or not np.isfinite(moved).all():
+    shifts_of_views = np.zeros((theta.size, 2)) if shifts is None else np.asarray(shifts, np.float64)
+    if shifts_of_views.shape != (theta.size, 2) or not np.isfinite(shifts_of_views).all():
         raise ValueError(
-            f"shifts must be finite pixels (col, row) with shape [{theta.size}, 2], got shape {moved.shape}"
+            f"shifts must be finite pixels (col, row) with shape [{theta.size}, 2], got shape {shifts_of_views.shape}"
         )
     roll, tilt = (_checked_turns(name, where.get(name, 0.0), theta.size) for name in ("roll", "tilt"))
     return {
         "angles": frozen(theta), "detector_shape": (rows, cols), "pixel_pitch": float(pixel_pitch),
-        "axis_col": col, "axis_row": row, "shifts": frozen(moved), "roll": roll, "tilt": tilt,
+        "axis_col": col, "axis_row": row, "shifts": frozen(shifts_of_views), "roll": roll, "tilt": tilt,
     }  # fmt: skip
 
 
@@ -76,16 +77,18 @@ def checked_angles(angles: ArrayLike) -> F64:
     if theta.ndim != 1 or theta.size == 0:
         raise ValueError(f"angles must be a list of at least one angle in radians, got shape {theta.shape}")
     if not np.isfinite(theta).all():
-        bad = np.flatnonzero(~np.isfinite(theta))[:8].tolist()
-        raise ValueError(f"{(~np.isfinite(theta)).sum()} of {theta.size} angles are not finite (projections {bad} ...)")
+        not_finite = np.flatnonzero(~np.isfinite(theta))[:8].tolist()
+        raise ValueError(
+            f"{(~np.isfinite(theta)).sum()} of {theta.size} angles are not finite (projections {not_finite} ...)"
+        )
     return theta
 
 
 def _checked_turns(name: str, turns: Any, views: int) -> F64:
-    given = np.asarray(turns, np.float64)
-    if given.shape not in ((), (views,)) or not np.isfinite(given).all():
+    values = np.asarray(turns, np.float64)
+    if values.shape not in ((), (views,)) or not np.isfinite(values).all():
         raise ValueError(
             f"{name} must be finite radians: one number for all projections, or an array of shape [{views}]; got "
-            f"shape {given.shape}"
+            f"shape {values.shape}"
         )
-    return frozen(np.broadcast_to(given, (views,)))
+    return frozen(np.broadcast_to(values, (views,)))

@@ -15,7 +15,7 @@ from recon.base.volume import Grid
 LEAST = 0.1
 """Line integral at an edge above which there is material; phase fringes, scatter and a drift of air are lower."""
 
-_FEWEST = 2  # fewest projections in which material leaves the field of view
+_LEAST_CUT_VIEWS = 2  # fewest projections in which material leaves the field of view
 
 SAMPLE = "sample_radius"
 """Name of the decision on the sample radius, and prefix of its settings."""
@@ -78,12 +78,19 @@ class FieldEdges:
         changed.
         """
         least = max(LEAST, EMPTY * self.mean)
-        at = {side: levels > least for side, levels in self.of_views.items()}
-        count = sum(flags.astype(int) for flags in at.values())
-        if self.beyond() or not at or np.max(count) > 1 or not _FEWEST <= np.sum(count) < self.views.size:
+        is_beyond = {side: levels > least for side, levels in self.of_views.items()}
+        count = sum(flags.astype(int) for flags in is_beyond.values())
+        if (
+            self.beyond()
+            or not is_beyond
+            or np.max(count) > 1
+            or not _LEAST_CUT_VIEWS <= np.sum(count) < self.views.size
+        ):
             return {}
         return {
-            side: (int(self.views[flags][0]), int(self.views[flags][-1])) for side, flags in at.items() if flags.any()
+            side: (int(self.views[flags][0]), int(self.views[flags][-1]))
+            for side, flags in is_beyond.items()
+            if flags.any()
         }
 
 
@@ -125,5 +132,5 @@ class Reach:
             return True
         whole = self.box(Grid.matching(geometry), geometry)
         (low, high), (first, last) = whole.edges, grid.edges
-        room = np.array(grid.spacing[::-1])
-        return bool((first - low > room).any() or (high - last > room).any())
+        spacing = np.array(grid.spacing[::-1])
+        return bool((first - low > spacing).any() or (high - last > spacing).any())

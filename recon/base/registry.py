@@ -53,22 +53,21 @@ def add_on_missing(name: str) -> str:
     """The end of a sentence, without a full stop, that says why an add-on of `ADD_ONS` is missing and what to do."""
     for point in entry_points_announced():
         if point.name == name:
-            why = "is installed, but could not be used: read the earlier warning, which gives the reason"
+            reason = "is installed, but could not be used: read the earlier warning, which gives the reason"
             try:
                 point.load()
             except (Exception, SystemExit) as error:
-                why = _one_line(f"{type(error).__name__}: {error}")
+                reason = _one_line(f"{type(error).__name__}: {error}")
             package = ADD_ONS[name] if point.dist is None else point.dist.name
-            return (
-                f"is installed, but does not load ({point.value}: {why}). Try: pip install --force-reinstall {package}"
-            )
+            reinstall = f"pip install --force-reinstall {package}"
+            return f"is installed, but does not load ({point.value}: {reason}). Try: {reinstall}"
     return f"is in a package that is not installed. Install it with: pip install {ADD_ONS[name]}"
 
 
 def did_you_mean(name: object, legal: Iterable[str]) -> str:
     """The end of a sentence that suggests the most similar legal name, with a space before it; "" if no name is
     similar."""
-    return f" (did you mean {near}?)" if (near := nearest(name, legal)) else ""
+    return f" (did you mean {nearest_name}?)" if (nearest_name := nearest(name, legal)) else ""
 
 
 def nearest(name: object, legal: Iterable[str]) -> str:
@@ -86,14 +85,14 @@ def signals_waiting() -> Iterator[None]:
     If a handler raised an exception during an import, the library would be only half loaded. numba and torch would then
     fail until Python is restarted.
     """
-    came = list[tuple[Any, Any]]()
+    received = list[tuple[Any, Any]]()
     with ExitStack() as stack:
         if threading.current_thread() is threading.main_thread():
             handlers = {s: handler for s in signal.valid_signals() if callable(handler := signal.getsignal(s))}
-            stack.callback(lambda: [handlers[s](s, frame) for s, frame in came])  # runs last
+            stack.callback(lambda: [handlers[s](s, frame) for s, frame in received])  # runs last
             for number, handler in handlers.items():
                 stack.callback(signal.signal, number, handler)
-                signal.signal(number, lambda s, frame: came.append((s, frame)))
+                signal.signal(number, lambda s, frame: received.append((s, frame)))
         yield
 
 
@@ -195,8 +194,8 @@ def plugins(
     for point in announced:
         try:
             if point.name in taken or times[point.name] > 1:
-                by = "splatline" if point.name in taken else "another plug-in"
-                raise ValueError(f"the name is already used by {by}; choose another name")
+                owner = "splatline" if point.name in taken else "another plug-in"
+                raise ValueError(f"the name is already used by {owner}; choose another name")
             with signals_waiting(), redirect_stdout(sys.stderr):  # stdout is for results
                 found[point.name] = made(point.name, point.load())
         except (Exception, SystemExit) as error:  # an error in another package must not stop a scan

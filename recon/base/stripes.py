@@ -15,10 +15,10 @@ from recon.base.geometry import Geometry
 _BLOCKS, _BLOCK = 8, 5
 _RING_VIEWS, _NEIGHBOURS = 20, 9  # fewest projections; number of pixels along a row
 # two limits in standard deviations; smallest number of columns that have a mirrored column
-_SURE, _SHARED, _FEWEST_PAIRS = 3.0, 2.0, 40
+_STANDARD_ERRORS, _SHARED, _FEWEST_PAIRS = 3.0, 2.0, 40
 NARROWEST = 64  # least columns; with 40 columns, the methods that remove stripes add larger errors than they remove
 # `Steadiness.score` from which on there are stripes. Scans without stripes have 0.3 to 2.7, two real scans 4.4 and 5.3
-_SEEN = 3.5
+_VISIBLE_SCORE = 3.5
 # smallest ratio of the odd to the even part. For pixel sensitivities both parts are equal; for layers of the sample the
 # odd part is almost 0
 _ONE_SIDED = 0.5
@@ -56,12 +56,12 @@ def ring_offsets(residual: F32, geometry: Geometry) -> F32:
     steady += without_layers(shared, axis_col) - shared
     error2 = blocks.var(axis=0) / (len(blocks) - 1)
     error2 = np.maximum(error2, np.median(error2)) + 1e-30
-    odd = (blocks - mirrored(blocks, axis_col)) / math.sqrt(2)
-    spread2 = median_deviation(odd.mean(axis=0)) ** 2 - median_deviation(odd - odd.mean(axis=0)) ** 2 / (
-        len(blocks) - 1
-    )
+    differences = (blocks - mirrored(blocks, axis_col)) / math.sqrt(2)
+    spread2 = median_deviation(differences.mean(axis=0)) ** 2 - median_deviation(
+        differences - differences.mean(axis=0)
+    ) ** 2 / (len(blocks) - 1)
     prior = max(spread2, 0.0)
-    share = np.where(steady**2 > _SURE**2 * error2, 1.0, prior / (prior + error2))
+    share = np.where(steady**2 > _STANDARD_ERRORS**2 * error2, 1.0, prior / (prior + error2))
     return np.asarray(steady * share, np.float32)
 
 
@@ -86,13 +86,13 @@ def without_layers(stripes: F32, axis_col: float) -> F32:
     belongs to layers of the sample around the axis. By chance this happens for one in 800 pairs of independent columns.
     Columns without a mirrored column are not changed.
     """
-    across = mirrored(stripes, axis_col)
-    seen = np.isfinite(across[0])
+    opposite = mirrored(stripes, axis_col)
+    seen = np.isfinite(opposite[0])
     if seen.sum() < _FEWEST_PAIRS:
         return stripes
-    usual = _SHARED * median_deviation((stripes - across)[:, seen] / math.sqrt(2))
-    near = np.where(seen, across, 0)
-    low, high = (extreme(near, (1, 3), mode="nearest") for extreme in (minimum_filter, maximum_filter))
+    usual = _SHARED * median_deviation((stripes - opposite)[:, seen] / math.sqrt(2))
+    opposite_or_zero = np.where(seen, opposite, 0)
+    low, high = (extreme(opposite_or_zero, (1, 3), mode="nearest") for extreme in (minimum_filter, maximum_filter))
     shared = np.where(stripes > 0, np.clip(high, 0, np.maximum(stripes, 0)), np.clip(low, np.minimum(stripes, 0), 0))
     return np.asarray(stripes - np.where(seen & (np.abs(shared) > usual), shared, 0), np.float32)
 
@@ -124,7 +124,7 @@ class Steadiness:
     @property
     def stripes(self) -> bool:
         """Whether the sensitivities of the pixels differ."""
-        return self.score > _SEEN and self.odd > _ONE_SIDED * self.even
+        return self.score > _VISIBLE_SCORE and self.odd > _ONE_SIDED * self.even
 
 
 def steadiness(sinograms: F32, axis_col: float) -> Steadiness | None:
@@ -137,20 +137,20 @@ def steadiness(sinograms: F32, axis_col: float) -> Steadiness | None:
     """
     n, rows, cols = sinograms.shape
     blocks = np.array_split(np.arange(n), min(max(n // _STEADY_BLOCK, 2), _STEADY_BLOCKS))
-    right = np.arange(math.ceil(axis_col + AT_AXIS), cols)
-    right = right[2 * axis_col - right >= 0]
-    if right.size < _FEWEST_MIRRORED:
+    right_columns = np.arange(math.ceil(axis_col + AT_AXIS), cols)
+    right_columns = right_columns[2 * axis_col - right_columns >= 0]
+    if right_columns.size < _FEWEST_MIRRORED:
         return None
     fine = np.stack([[_fine_columns(sinograms[block, row]) for row in range(rows)] for block in blocks])
-    own, across = fine[..., right], mirrored(fine, axis_col)[..., right]
-    odd, even = (own - across) / math.sqrt(2), (own + across) / math.sqrt(2)
-    mean = odd.mean(axis=0)
-    noise = median_deviation(odd - mean) / math.sqrt(len(blocks) - 1)
-    return Steadiness(median_deviation(mean), median_deviation(even.mean(axis=0)), noise)
+    own, mirrored_values = fine[..., right_columns], mirrored(fine, axis_col)[..., right_columns]
+    half_difference, half_sum = (own - mirrored_values) / math.sqrt(2), (own + mirrored_values) / math.sqrt(2)
+    mean = half_difference.mean(axis=0)
+    noise = median_deviation(half_difference - mean) / math.sqrt(len(blocks) - 1)
+    return Steadiness(median_deviation(mean), median_deviation(half_sum.mean(axis=0)), noise)
 
 
 def _fine_columns(sinogram: F32) -> NDArray[np.floating]:
     """[col] median difference of a column from its four neighbours, without slow changes along the row."""
     x = np.pad(sinogram, ((0, 0), (2, 2)), mode="edge")
-    off = np.median(x[:, 2:-2] - (x[:, :-4] + x[:, 1:-3] + x[:, 3:-1] + x[:, 4:]) / 4, axis=0)
-    return np.asarray(np.convolve(off, (-0.5, 1, -0.5), mode="same"))
+    deviations = np.median(x[:, 2:-2] - (x[:, :-4] + x[:, 1:-3] + x[:, 3:-1] + x[:, 4:]) / 4, axis=0)
+    return np.asarray(np.convolve(deviations, (-0.5, 1, -0.5), mode="same"))

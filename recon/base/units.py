@@ -11,16 +11,16 @@ from recon.base.arrays import median_deviation, some_values
 from recon.base.views import spread
 
 HC = 1.239841984e-6  # keV mm: product of wavelength in mm and photon energy (CODATA 2018)
-_TURNS = 10  # fewer turns are plausible in radians, unless all angles are whole numbers
-_FEWEST = 5  # with fewer projections there is no warning
+_MOST_TURNS = 10  # fewer turns are plausible in radians, unless all angles are whole numbers
+_LEAST_VIEWS = 5  # with fewer projections there is no warning
 _ROUND = 0.01  # tolerance, as a share of 360° or 180°
 _OPAQUE = 15.0  # line integral; no detector measures a transmission of exp(-15) in nine of ten pixels
-_LOOKED_AT = 2**16  # number of values in the sample
+_SAMPLED_VALUES = 2**16  # number of values in the sample
 _VIEWS, _ROWS, _VALUES = 32, 64, 2**21  # size of the sample in which transmission is searched for
 # tolerance of the beam level in transmission: its difference from 1, and its difference between projections
 _LEVEL = 0.15
 _NOT_ABOVE = 0.03  # share of the beam; nine values in ten are at most this much above it
-_EDGE = 32  # one of this many columns belongs to an edge
+_COLUMNS_PER_EDGE = 32  # one of this many columns belongs to an edge
 _SIGMAS = 3.0
 
 
@@ -32,23 +32,23 @@ def look_like_degrees(angles: NDArray[np.floating], ended: bool = True) -> bool:
     many turns passes 180 rad.
     """
     distinct = np.unique(angles)
-    if distinct.size < _FEWEST or not np.isfinite(distinct).all():
+    if distinct.size < _LEAST_VIEWS or not np.isfinite(distinct).all():
         return False
     span = float(distinct[-1] - distinct[0])
-    if span >= _FEWEST - 1 and np.array_equal(distinct, np.round(distinct)):
+    if span >= _LEAST_VIEWS - 1 and np.array_equal(distinct, np.round(distinct)):
         return True
-    if span <= 2 * np.pi * _TURNS:
+    if span <= 2 * np.pi * _MOST_TURNS:
         return False
     round_numbers = np.allclose(distinct * 100, np.round(distinct * 100), rtol=0, atol=1e-3)
     whole = span + span / (distinct.size - 1)
-    turns = ended and any(abs(s / turn - 1) < 1e-3 for s in (span, whole) for turn in (180, 360))
-    return bool(round_numbers or turns)
+    is_whole_turn = ended and any(abs(s / turn - 1) < 1e-3 for s in (span, whole) for turn in (180, 360))
+    return bool(round_numbers or is_whole_turn)
 
 
 def gone_round(angles: NDArray[np.floating], turn: float) -> float:
     """Half a `turn` or a whole `turn`, whichever the distinct angles [view] cover (with or without the last angle); 0
     if they cover neither."""
-    span = float(np.ptp(angles)) if angles.size >= _FEWEST else 0.0
+    span = float(np.ptp(angles)) if angles.size >= _LEAST_VIEWS else 0.0
     spans = span, span + span / max(angles.size - 1, 1)
     return next((part for part in (turn / 2, turn) if min(abs(each / part - 1) for each in spans) < _ROUND), 0.0)
 
@@ -69,11 +69,11 @@ def look_like_counts(projections: NDArray[np.floating]) -> bool:
     Values look like counts if nine in ten of them are so large that no detector could measure the remaining intensity.
     If all values are whole numbers, half of them being so large is enough.
     """
-    some = some_values(projections, _LOOKED_AT)
-    some = some[np.isfinite(some)]
-    if some.size == 0 or not np.median(some) > _OPAQUE:
+    sampled = some_values(projections, _SAMPLED_VALUES)
+    sampled = sampled[np.isfinite(sampled)]
+    if sampled.size == 0 or not np.median(sampled) > _OPAQUE:
         return False
-    return bool(np.quantile(some, 0.1) > _OPAQUE or np.array_equal(some, np.round(some)))
+    return bool(np.quantile(sampled, 0.1) > _OPAQUE or np.array_equal(sampled, np.round(sampled)))
 
 
 def look_like_transmission(projections: NDArray[np.floating]) -> bool:
@@ -90,30 +90,30 @@ def look_like_transmission(projections: NDArray[np.floating]) -> bool:
         return False
     views, rows, cols = projections.shape
     looked_at = max(_VIEWS, _VALUES // (min(rows, _ROWS) * cols))
-    some = projections[spread(np.arange(views), looked_at)][:, spread(np.arange(rows), _ROWS)].astype(np.float32)
-    some[~np.isfinite(some)] = np.nan
-    width, middle = cols // _EDGE or 1, some[..., cols // 3 : cols - cols // 3]
-    edges = np.concatenate([some[..., :width], some[..., -width:]])
-    within = np.concatenate([some[..., width : 2 * width], some[..., -2 * width : -width]])
-    seen = np.isfinite(edges).any(axis=(1, 2)) & np.isfinite(within).any(axis=(1, 2))
+    sampled = projections[spread(np.arange(views), looked_at)][:, spread(np.arange(rows), _ROWS)].astype(np.float32)
+    sampled[~np.isfinite(sampled)] = np.nan
+    width, middle = cols // _COLUMNS_PER_EDGE or 1, sampled[..., cols // 3 : cols - cols // 3]
+    edges = np.concatenate([sampled[..., :width], sampled[..., -width:]])
+    inner = np.concatenate([sampled[..., width : 2 * width], sampled[..., -2 * width : -width]])
+    seen = np.isfinite(edges).any(axis=(1, 2)) & np.isfinite(inner).any(axis=(1, 2))
     if not seen.any() or not np.isfinite(middle).any():
         return False
-    edges, within = edges[seen], within[seen]
-    levels, beside = (np.nanmedian(part, axis=(1, 2)) for part in (edges, within))
-    air = levels + beside >= np.median(levels + beside)  # the sample may reach the other edges
+    edges, inner = edges[seen], inner[seen]
+    levels, inner_levels = (np.nanmedian(part, axis=(1, 2)) for part in (edges, inner))
+    air = levels + inner_levels >= np.median(levels + inner_levels)  # the sample may reach the other edges
     beam = float(np.median(levels[air]))
     scatter = edges[air] - levels[air, None, None]
     noise = median_deviation(scatter)
-    lowest, highest = np.nanquantile(some, (0.001, 0.9))
+    lowest, highest = np.nanquantile(sampled, (0.001, 0.9))
     if (np.abs(levels[air] - 1) > _LEVEL).any() or lowest < -_NOT_ABOVE - _SIGMAS * noise:
         return False
     if highest > levels.max() * (1 + _NOT_ABOVE) + 2 * noise:
         return False
     fall = beam - float(np.nanmean(middle))
-    step = float(np.mean(levels[air] - beside[air]))
+    step = float(np.mean(levels[air] - inner_levels[air]))
     # twice the standard error of the difference of two medians at the edges
     uncertain = 2 * noise / np.sqrt(np.isfinite(edges[air]).sum())
-    flat = fall / _EDGE  # a convex profile falls twice as much from the edge to the next columns
+    flat = fall / _COLUMNS_PER_EDGE  # a convex profile falls twice as much from the edge to the next columns
     return bool(step < flat and flat > max(_SIGMAS * uncertain, 1e-4 * beam))
 
 

@@ -48,24 +48,24 @@ def geometry_of_vectors(vectors: ArrayLike, detector_shape: tuple[int, int], *, 
             projection do not describe a detector with square pixels (tolerance: `TOLERANCE` pixels at the corners).
     """
     check_arguments(geometry_of_vectors, locals())
-    given = np.asarray(vectors, np.float64)
+    table = np.asarray(vectors, np.float64)
     rows, cols = detector_shape
-    if given.ndim != 2 or given.shape[1] != 12 or not len(given):
-        raise ValueError(f"vectors must have shape [view, 12] (ray direction or source, d, u, v), got {given.shape}")
-    if not np.isfinite(given).all():
-        bad = int(np.flatnonzero(~np.isfinite(given).all(axis=1))[0])
-        raise ValueError(f"the vectors of projection {bad} are not finite: {given[bad].tolist()}")
-    first, middle, u, v = given.reshape(-1, 4, 3).transpose(1, 0, 2)
+    if table.ndim != 2 or table.shape[1] != 12 or not len(table):
+        raise ValueError(f"vectors must have shape [view, 12] (ray direction or source, d, u, v), got {table.shape}")
+    if not np.isfinite(table).all():
+        bad_view = int(np.flatnonzero(~np.isfinite(table).all(axis=1))[0])
+        raise ValueError(f"the vectors of projection {bad_view} are not finite: {table[bad_view].tolist()}")
+    first, middle, u, v = table.reshape(-1, 4, 3).transpose(1, 0, 2)
     if not cone:
         u, v = (_across(vector, first) for vector in (u, v))
     frame = _frame(u, v)
     along_cols, along_rows, beam = frame
     sizes = (_dot(u, along_cols) + _dot(v, along_rows)) / 2
-    distances = _distances(middle - first, beam) if cone else np.ones(len(given))
+    distances = _distances(middle - first, beam) if cone else np.ones(len(table))
     sdd = float(np.median(distances))
-    apart = (sdd / distances)[:, None]  # factor that scales to a detector at the common distance
-    pitch = float(np.median(sizes * apart[:, 0]))
-    _require_pixels(u * apart, v * apart, frame, pitch, (rows, cols))
+    scale = (sdd / distances)[:, None]  # factor that scales to a detector at the common distance
+    pitch = float(np.median(sizes * scale[:, 0]))
+    _require_pixels(u * scale, v * scale, frame, pitch, (rows, cols))
     foot = first + distances[:, None] * beam if cone else np.zeros_like(middle)  # the origin is projected to this point
     pixels = np.stack((_dot(foot - middle, along_cols), _dot(foot - middle, along_rows)), 1) / sizes[:, None]
     pixels += (cols - 1) / 2, (rows - 1) / 2
@@ -104,8 +104,8 @@ def vectors_of(geometry: Geometry) -> F64:
     rows, cols = geometry.detector_shape
     axes = np.array([geometry.axes(view) for view in range(geometry.n_views)])
     along_cols, along_rows, beam = axes.transpose(1, 0, 2)
-    off = np.array([geometry.origin(view) for view in range(geometry.n_views)]) - ((cols - 1) / 2, (rows - 1) / 2)
-    middle = -geometry.pixel_pitch * (off[:, :1] * along_cols + off[:, 1:] * along_rows)
+    origins = np.array([geometry.origin(view) for view in range(geometry.n_views)]) - ((cols - 1) / 2, (rows - 1) / 2)
+    middle = -geometry.pixel_pitch * (origins[:, :1] * along_cols + origins[:, 1:] * along_rows)
     first = beam
     if geometry.is_cone:
         first = geometry.centres - geometry.sod * beam
@@ -126,8 +126,8 @@ def _across(vectors: F64, rays: F64) -> F64:
     lengths = np.linalg.norm(rays, axis=1, keepdims=True)
     if not lengths.all():
         raise ValueError(f"projection {int(np.flatnonzero(lengths == 0)[0])}: the direction of the beam is zero")
-    along = rays / lengths
-    return vectors - _dot(vectors, along)[:, None] * along
+    directions = rays / lengths
+    return vectors - _dot(vectors, directions)[:, None] * directions
 
 
 def _frame(u: F64, v: F64) -> tuple[F64, F64, F64]:
@@ -162,13 +162,13 @@ def _require_pixels(u: F64, v: F64, frame: tuple[F64, F64, F64], size: float, sh
     by_col, by_row = ((vector - size * unit) / size for vector, unit in zip((u, v), frame, strict=False))
     rows, cols = shape
     corners = [by_col * cols / 2 + sign * by_row * rows / 2 for sign in (1, -1)]
-    off = np.linalg.norm(corners, axis=2).max(axis=0)
-    view = int(np.argmax(off))
-    if off[view] > TOLERANCE:
+    deviations = np.linalg.norm(corners, axis=2).max(axis=0)
+    view = int(np.argmax(deviations))
+    if deviations[view] > TOLERANCE:
         raise ValueError(
             f"projection {view}: the detector pixels must be squares of {size:.6g} as in the other projections. A "
-            f"corner of the detector is off by {off[view]:.3g} pixels, and {TOLERANCE} are allowed. Resample the "
-            "projections to one detector"
+            f"corner of the detector is off by {deviations[view]:.3g} pixels, and {TOLERANCE} are allowed. Resample "
+            "the projections to one detector"
         )
 
 

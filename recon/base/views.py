@@ -96,14 +96,14 @@ def _sector(
 def _even(views: NDArray[np.int64], theta: NDArray[np.float64], n: int, period: float) -> NDArray[np.int64]:
     """n of the projections, evenly spread over the distinct angles in a period, or over all projections if the distinct
     angles are too few."""
-    once = np.sort(np.mod(theta[views], period))
-    gaps = np.diff(once, append=once[0] + period)
+    within_period = np.sort(np.mod(theta[views], period))
+    gaps = np.diff(within_period, append=within_period[0] + period)
     step = float(np.median(gaps[gaps > 1e-9]))
-    place = np.mod(theta[views] - theta[views[0]] + 0.05 * step, period)  # counted from the first projection
-    order = np.argsort(place, kind="stable")
-    starts = np.flatnonzero(np.diff(place[order], prepend=-np.inf) > 0.1 * step)
+    angle_from_first = np.mod(theta[views] - theta[views[0]] + 0.05 * step, period)  # counted from the first projection
+    order = np.argsort(angle_from_first, kind="stable")
+    first_of_step = np.flatnonzero(np.diff(angle_from_first[order], prepend=-np.inf) > 0.1 * step)
     # the earliest projection at each angle
-    distinct = np.minimum.reduceat(order, starts) if starts.size >= n else order
+    distinct = np.minimum.reduceat(order, first_of_step) if first_of_step.size >= n else order
     return np.sort(views[distinct[np.arange(n) * distinct.size // n]])
 
 
@@ -114,14 +114,14 @@ def spread_views(angles: NDArray[np.float64], n: int, frames: NDArray[np.int64])
         angles: [frame], radians.
         frames: [frame], their indices in the file.
     """
-    every = np.arange(angles.size)
+    all_numbers = np.arange(angles.size)
     if angles.size <= n:
         return frames
     if np.ptp(angles) < 1.5 * np.pi:
-        return frames[spread(every, n)]
-    some = spread(every, n // 2)
-    away = np.abs(np.mod(angles[some][:, None] - angles + np.pi, 2 * np.pi) - np.pi)
-    return frames[np.union1d(some, away.argmax(axis=1))]
+        return frames[spread(all_numbers, n)]
+    first_half = spread(all_numbers, n // 2)
+    distances = np.abs(np.mod(angles[first_half][:, None] - angles + np.pi, 2 * np.pi) - np.pi)
+    return frames[np.union1d(first_half, distances.argmax(axis=1))]
 
 
 def spread(items: NDArray[np.int64], n: int) -> NDArray[np.int64]:

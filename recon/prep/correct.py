@@ -43,7 +43,7 @@ def apply(
 
     Raises:
         ValueError: as for `CorrectionPlan.transmission`.
-        UnlitViewsError: the air columns of some projections are dark. The error contains the numbers of these
+        ViewsWithoutBeamError: the air columns of some projections are dark. The error contains the numbers of these
             projections.
     """
     if not len(view_ids):

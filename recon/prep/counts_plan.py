@@ -32,7 +32,7 @@ from recon.prep.spots import SpotFilter, Transmission
 from recon.prep.unmeasured import NO_RUNS, runs_of, unmeasured
 
 
-class UnlitViewsError(ValueError):
+class ViewsWithoutBeamError(ValueError):
     """The air columns of some projections are dark (the beam was off)."""
 
 
@@ -216,7 +216,7 @@ class CorrectionPlan:
             order: order of neighbours, see `SpotFilter.feed`.
 
         Raises:
-            UnlitViewsError: the air columns of some projections are dark; the error contains their numbers.
+            ViewsWithoutBeamError: the air columns of some projections are dark; the error contains their numbers.
         """
         settings, columns, floored = self.settings, self.air_columns, 0
         views, spots = self.spots.feed(views and self._levelled(views), last, progress, order)
@@ -240,7 +240,7 @@ class CorrectionPlan:
         level, columns = air_transmission(views.data, *self.air_columns), self.air_columns
         without_beam = views.view_ids[~(level.min(axis=1) > self.settings.floor)]
         if without_beam.size:
-            raise UnlitViewsError(
+            raise ViewsWithoutBeamError(
                 f"leave out the projections without beam: {without_beam.size} of {len(level)} "
                 f"({without_beam[:8].tolist()} ...). Their air columns, {columns[0]} on the left and {columns[1]} on "
                 "the right, are dark"

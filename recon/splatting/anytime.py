@@ -30,7 +30,7 @@ from recon.voxels.projector import Projector
 
 HALF = 60.0  # number of steps after which the rates are half of the first ones
 _WINDOW = 0.25  # share of the steps over which the mean is computed
-_EVERY = 4  # steps between two terms of the mean
+_MEAN_STEPS = 4  # steps between two terms of the mean
 
 WHILE_VIEWS_COME = FitSettings(decay=0.02, policy=DensityPolicy(start=0.0, stop=2.0))
 """Settings of a fit during a scan. They differ from those of a fit to all projections by lower final rates.
@@ -55,8 +55,8 @@ def fallen(steps: int, settings: FitSettings) -> float:
 
     If the first rates are lower by a factor, it takes longer by this factor until they have fallen to their half.
     """
-    half = HALF * WHILE_VIEWS_COME.pace / settings.pace
-    return min(1.0, math.log1p(steps / half) / max(-math.log(settings.decay), 1e-9))
+    half_steps = HALF * WHILE_VIEWS_COME.pace / settings.pace
+    return min(1.0, math.log1p(steps / half_steps) / max(-math.log(settings.decay), 1e-9))
 
 
 def average(state: FitState, since: int) -> None:
@@ -65,13 +65,13 @@ def average(state: FitState, since: int) -> None:
     Args:
         since: the step from which the last quarter is counted.
     """
-    if state.step % _EVERY:
+    if state.step % _MEAN_STEPS:
         return
     settle(state)
     if state.mean is None:
         state.mean = {name: values + 0 for name, values in state.parameters.items()}
         return
-    share = _EVERY / (_EVERY + _WINDOW * (state.step - since))
+    share = _MEAN_STEPS / (_MEAN_STEPS + _WINDOW * (state.step - since))
     for name, values in state.parameters.items():
         state.mean[name] += share * (values - state.mean[name])
 
@@ -129,19 +129,20 @@ def covered_angle(theta: NDArray[np.float64]) -> float:
     return float(np.pi - np.diff(ordered, append=ordered[0] + np.pi).max())
 
 
-def shift_with_axis(theta: NDArray[np.float64], moved: float) -> NDArray[np.float32]:
-    """The shift (x, y) of all points that best corresponds to a shift of the axis by `moved`, for the angles `theta`.
+def shift_with_axis(theta: NDArray[np.float64], axis_shift: float) -> NDArray[np.float32]:
+    """The shift (x, y) of all points that best corresponds to a shift of the axis by `axis_shift`, for the angles
+    `theta`.
 
     If the axis is wrong by d, a point appears at x cos θ + y sin θ + d. The shift (a, b) makes a cos θ + b sin θ as
     near to d as possible. For evenly spread projections, it is (0, 4 d / π).
     """
-    across = np.stack((np.cos(theta), np.sin(theta)), 1)
-    return np.linalg.lstsq(across, np.full(theta.size, moved), rcond=None)[0].astype(np.float32)
+    directions = np.stack((np.cos(theta), np.sin(theta)), 1)
+    return np.linalg.lstsq(directions, np.full(theta.size, axis_shift), rcond=None)[0].astype(np.float32)
 
 
 _ROWS = 8  # number of rows that are compared
 _VIEWS = 400  # largest number of projections of an FBP; if there are more, an evenly spread part of them is used
-_COMPARED = 4  # number of held-out projections that are compared (the latest ones)
+_COMPARED_VIEWS = 4  # number of held-out projections that are compared (the latest ones)
 
 
 def volume_error(rendered: F32, measured: F32) -> float:
@@ -190,7 +191,7 @@ class PredictionErrors:
         """
         if not held_out or not geometry.rows_show_slices:
             return cls()
-        last = [view for each in held_out[-_COMPARED:] for view in (each - 1, each)]
+        last = [view for each in held_out[-_COMPARED_VIEWS:] for view in (each - 1, each)]
         measured = np.stack([images[view] for view in last])
         rows = busiest_rows(measured, _ROWS)
         slab, learnt = geometry.rows(rows.start, rows.stop), np.setdiff1d(np.arange(len(images)), held_out)

@@ -198,10 +198,10 @@ class Cpu:
         return CpuProjectionLoss(shape, ssim_weight, term=term)
 
     def misfit(self, image: F32, target: F32, weights: F32 | None) -> float:
-        off = image - target if weights is None else weights * (image - target)
+        residual = image - target if weights is None else weights * (image - target)
         measured = target if weights is None else weights * target
         power = float(np.vdot(measured, measured))
-        return (float(np.vdot(off, off)) / power) ** 0.5 if power > 0 else 0.0
+        return (float(np.vdot(residual, residual)) / power) ** 0.5 if power > 0 else 0.0
 
     def total_variation(self, volume: F32, weight: float) -> tuple[float, F32]:
         gradient = np.empty_like(volume)

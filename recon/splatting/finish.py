@@ -44,7 +44,7 @@ REFINEMENT = "refinement"
 """Name of the setting that says which method refined the voxels: "fista-tv", "pnp-dct" after it, or a method of `PULLS`
 after it. It is not set if the voxels were not refined."""
 
-_REACH = 1.5  # a Gaussian counts as reaching this many standard deviations of its longest axis
+_REACH_SIGMAS = 1.5  # a Gaussian counts as reaching this many standard deviations of its longest axis
 
 
 def beyond_voxels(gaussians: Gaussians, views: Geometry, grid: Grid, settings: FitSettings) -> F32 | None:
@@ -57,15 +57,15 @@ def beyond_voxels(gaussians: Gaussians, views: Geometry, grid: Grid, settings: F
     """
     import torch
 
-    half = np.multiply(grid.shape, grid.spacing)[::-1] / 2
-    reach = _REACH * gaussians.scales.max(dim=1, keepdim=True).values
-    outside = (gaussians.means - torch.tensor(grid.centre[::-1])).abs() + reach > torch.from_numpy(half)
-    gaussians = gaussians.select(outside.any(dim=1))
+    half_size = np.multiply(grid.shape, grid.spacing)[::-1] / 2
+    reach = _REACH_SIGMAS * gaussians.scales.max(dim=1, keepdim=True).values
+    is_outside = (gaussians.means - torch.tensor(grid.centre[::-1])).abs() + reach > torch.from_numpy(half_size)
+    gaussians = gaussians.select(is_outside.any(dim=1))
     if not gaussians.n:
         return None
-    inside = voxel_means(gaussians, grid, views, truncation=settings.truncation).numpy()
+    lines_inside = voxel_means(gaussians, grid, views, truncation=settings.truncation).numpy()
     model = project(gaussians, views, truncation=settings.truncation, model=settings.rays).numpy()
-    return model - Projector(views, grid).forward(np.maximum(inside, 0))
+    return model - Projector(views, grid).forward(np.maximum(lines_inside, 0))
 
 
 def level_of(beyond: F32) -> F32:

@@ -16,7 +16,7 @@ from recon.base.registry import LibraryError, loaded
 if TYPE_CHECKING:
     from torch import Tensor
 
-_FAINTEST = 1e-30  # smallest density, in density units
+_FAINTEST_DENSITY = 1e-30  # smallest density, in density units
 _PARAMETERS = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "raw_densities": ()}
 
 
@@ -85,9 +85,11 @@ class Gaussians:
                     f"{name} must be positive and finite, got values from {values.min()} to {values.max()}"
                 )
         unit = float(densities.max()) if density_unit is None else density_unit
-        turns = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)) if quaternions is None else np.asarray(quaternions, np.float64)
+        rotations = (
+            np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)) if quaternions is None else np.asarray(quaternions, np.float64)
+        )
         raw = inverse_softplus(densities / unit)
-        return cls(_tensor(means), _tensor(np.log(scales)), _tensor(turns), _tensor(raw), unit, kernel)
+        return cls(_tensor(means), _tensor(np.log(scales)), _tensor(rotations), _tensor(raw), unit, kernel)
 
     @property
     def n(self) -> int:
@@ -117,7 +119,9 @@ class Gaussians:
         if variance <= 0:
             return self
         wider = torch.sqrt(self.scales**2 + variance)
-        density = (self.densities * (self.scales / wider).prod(1) / self.density_unit).double().clamp(min=_FAINTEST)
+        density = (
+            (self.densities * (self.scales / wider).prod(1) / self.density_unit).double().clamp(min=_FAINTEST_DENSITY)
+        )
         raw = torch.from_numpy(inverse_softplus(density.detach().numpy())).to(self.raw_densities.dtype)
         return replace(self, log_scales=wider.log(), raw_densities=raw)
 
@@ -137,12 +141,12 @@ class Gaussians:
         return {name: value.detach().cpu().numpy() for name, value in values.items()}
 
 
-def turned_by_rows(gaussians: Gaussians, geometry: Geometry, sense: int) -> Gaussians:
+def turned_by_rows(gaussians: Gaussians, geometry: Geometry, sign: int) -> Gaussians:
     """The Gaussians, each rotated about the axis by the skew at its row. A Gaussian that extends over many rows is not
     bent.
 
     Args:
-        sense: -1 rotates from the object's frame to the frame in which all rows have the angle of the first row; 1
+        sign: -1 rotates from the object's frame to the frame in which all rows have the angle of the first row; 1
             rotates back.
     """
     if not geometry.skew:
@@ -150,10 +154,10 @@ def turned_by_rows(gaussians: Gaussians, geometry: Geometry, sense: int) -> Gaus
     import torch
 
     rows = gaussians.means[:, 2] / geometry.pixel_pitch + geometry.axis_row
-    turn = sense * geometry.skew * rows
-    c, s = torch.cos(turn), torch.sin(turn)
+    angle = sign * geometry.skew * rows
+    c, s = torch.cos(angle), torch.sin(angle)
     x, y, z = gaussians.means.unbind(1)
-    a, b = torch.cos(turn / 2), torch.sin(turn / 2)
+    a, b = torch.cos(angle / 2), torch.sin(angle / 2)
     qw, qx, qy, qz = gaussians.quaternions.unbind(1)
     return replace(
         gaussians,

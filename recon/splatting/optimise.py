@@ -188,26 +188,27 @@ def _fused(
     state: FitState, problem: FitProblem, settings: FitSettings, update: _Update, box: _RandomBox | None
 ) -> FusedStep | None:
     """The fused step of this state on the device. The same fused step is used again as long as its plan is the same."""
-    shape, before = None if box is None else box.shape, state.fused
+    shape, state_before = None if box is None else box.shape, state.fused
     key = (
         problem.loss, problem.grid, settings.truncation, settings.rays, settings.views_per_step,
         settings.tv_moves, update.bounds, shape, any(weights is not None for weights in problem.weights),
     )  # fmt: skip
     raw = state.parameters[NAMES[-1]]
-    if before is not None and before.plan.key == key and before.model.parameters[-1] is raw:
-        return before
+    if state_before is not None and state_before.plan.key == key and state_before.model.parameters[-1] is raw:
+        return state_before
     settle(state)
-    cut, small = settings.truncation, None if box is None else replace(box.grid(problem.grid), centre=(0.0, 0.0, 0.0))
+    truncation = settings.truncation
+    small_grid = None if box is None else replace(box.grid(problem.grid), centre=(0.0, 0.0, 0.0))
     plan = StepPlan(
-        key, problem.geometry, state.kernel, settings.rays, 1 / problem.half_field, cut.faint, cut.sigmas,
-        settings.views_per_step, problem.loss, key[-1], small, cut.faint / problem.half_field, settings.tv_moves,
-        update.bounds,
+        key, problem.geometry, state.kernel, settings.rays, 1 / problem.half_field, truncation.faint, truncation.sigmas,
+        settings.views_per_step, problem.loss, key[-1], small_grid, truncation.faint / problem.half_field,
+        settings.tv_moves, update.bounds,
     )  # fmt: skip
     parameters, first, second = (
         tuple(arrays[name] for name in NAMES) for arrays in (state.parameters, state.first, state.second)
     )
     model = StepModel(parameters, first, second, state.statistic, state.loss, state.residual)
-    state.fused = problem.backend.fused_step(model, plan, before)
+    state.fused = problem.backend.fused_step(model, plan, state_before)
     return state.fused
 
 
@@ -223,13 +224,13 @@ def _by_operations(
     update: _Update,
 ) -> None:  # fmt: skip
     """One step, operation by operation."""
-    p, geometry, backend, cut = state.parameters, problem.geometry, problem.backend, settings.truncation
+    p, geometry, backend, truncation = state.parameters, problem.geometry, problem.backend, settings.truncation
     run = backend.begin(p["means"], p["log_scales"], p["quaternions"], p["raw"], 1 / problem.half_field, state.kernel)
     loss: Any = 0.0
     share = len(views)
     for view in views:
         target, weights = problem.images[view], problem.weights[view]
-        rendered = run.view(geometry, view, cut.faint, cut.sigmas, settings.rays)
+        rendered = run.view(geometry, view, truncation.faint, truncation.sigmas, settings.rays)
         value, slope = problem.loss(rendered.image, target, problem.target_maps[view], weights)
         state.residual = _running(state.residual, backend.misfit(rendered.image, target, weights))
         if share > 1:
@@ -259,12 +260,12 @@ def misfit_of(state: FitState, problem: FitProblem, settings: FitSettings) -> fl
 def renders(state: FitState, problem: FitProblem, settings: FitSettings, views: Iterable[int]) -> Iterator[Any]:
     """The projections [row, col] of the model, in units of the problem's images, on its device."""
     settle(state)
-    p, cut = state.parameters, settings.truncation
+    p, truncation = state.parameters, settings.truncation
     run = problem.backend.begin(
         p["means"], p["log_scales"], p["quaternions"], p["raw"], 1 / problem.half_field, state.kernel
     )
     for view in views:
-        yield run.view(problem.geometry, view, cut.faint, cut.sigmas, settings.rays).image
+        yield run.view(problem.geometry, view, truncation.faint, truncation.sigmas, settings.rays).image
 
 
 def gaussians_of(state: FitState, backend: Backend[Any] | None = None) -> Gaussians:
@@ -299,11 +300,11 @@ def _running(mean: Any, value: Any) -> Any:
 
 def _smooth(problem: FitProblem, settings: FitSettings, weight: float, run: Pass[Any], box: Grid) -> Any:
     """Total variation of the normalised density on a box of voxels."""
-    cut = settings.truncation
-    filled = run.box(box, cut.faint / problem.half_field, cut.sigmas)
-    half = np.float32(problem.half_field)
-    loss, slope = problem.backend.total_variation(filled.density * half, weight)
-    filled.backward(slope * half, means_too=settings.tv_moves)
+    truncation = settings.truncation
+    filled = run.box(box, truncation.faint / problem.half_field, truncation.sigmas)
+    half_field = np.float32(problem.half_field)
+    loss, slope = problem.backend.total_variation(filled.density * half_field, weight)
+    filled.backward(slope * half_field, means_too=settings.tv_moves)
     return loss
 
 
@@ -318,7 +319,7 @@ def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
         2 * problem.half_field, state.limit, problem.grid.edges, state.rng,
     )  # fmt: skip
     origin = np.concatenate((change.keep, change.parents))
-    fresh = change.keep.size
+    first_new = change.keep.size
     if origin.size == 0:
         return  # all Gaussians are faint, for example in empty projections; later projections may need them
     parts = change.means, change.log_scales, p["quaternions"][origin], change.raw
@@ -328,10 +329,10 @@ def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
         for name, new in grown.items():
             mean = backend.numpy(state.mean[name])[origin]
             changed = new != p[name][origin]  # parents of splits and clones; the second halves are new, too
-            changed[fresh:] = True
+            changed[first_new:] = True
             state.mean[name] = backend.array(np.where(changed, new, mean)[order])
     state.parameters = {name: backend.array(values[order]) for name, values in grown.items()}
-    origin[fresh:] = -1  # the new Gaussians start without momentum
+    origin[first_new:] = -1  # the new Gaussians start without momentum
     for moments in (state.first, state.second):
         for name in NAMES:
             moments[name] = backend.taken(moments[name], origin[order])

@@ -113,9 +113,9 @@ def control(
     density = np.logaddexp(0, raw)
     lost = LOST if policy.rule == "mass" else 0.0
     reach = lost * np.exp(log_scales.max(axis=1, keepdims=True))
-    alive = (density >= policy.prune_below) & ((means >= box[0] - reach) & (means <= box[1] + reach)).all(axis=1)
-    wanted = np.flatnonzero(alive & (statistic > policy.threshold))
-    free = max(0, limit - int(alive.sum()))
+    is_kept = (density >= policy.prune_below) & ((means >= box[0] - reach) & (means <= box[1] + reach)).all(axis=1)
+    wanted = np.flatnonzero(is_kept & (statistic > policy.threshold))
+    free = max(0, limit - int(is_kept.sum()))
     if wanted.size > free:
         wanted = wanted[np.argsort(-statistic[wanted], kind="stable")[:free]]
         wanted.sort()
@@ -130,7 +130,7 @@ def control(
     new_means[wanted] += first
     new_scales[wanted] += narrower
     new_raw[wanted] = _inverse(density[wanted] / divisor)
-    keep = np.flatnonzero(alive)
+    keep = np.flatnonzero(is_kept)
     return Change(
         keep,
         wanted,
@@ -150,8 +150,8 @@ def _halves(log_scales: F32, rotations: F32) -> tuple[F32, F32, F32, float]:
         divisor of their density.
     """
     index, axis = np.arange(len(log_scales)), log_scales.argmax(axis=1)
-    apart, shrink = APART * np.exp(log_scales[index, axis]), math.sqrt(1 - APART**2)
-    offset = (apart[:, None] * rotations[index, :, axis]).astype(np.float32)
+    displacement, shrink = APART * np.exp(log_scales[index, axis]), math.sqrt(1 - APART**2)
+    offset = (displacement[:, None] * rotations[index, :, axis]).astype(np.float32)
     narrower = np.zeros_like(log_scales)
     narrower[index, axis] = math.log(shrink)
     return offset, -offset, narrower, 2 * shrink
@@ -269,8 +269,8 @@ def tv_weight(settings: FitSettings, problem: FitProblem, count: int) -> float:
         return settings.tv_weight
     rows, cols = problem.geometry.detector_shape
     pixels = problem.geometry.n_views * rows * cols / count
-    sharp = max(problem.change / TV_CHANGE, 1.0)
-    return min(max(TV_OF_NOISE * (problem.noise / sharp) ** 2 / pixels, settings.tv_least), TV_MOST)
+    change_ratio = max(problem.change / TV_CHANGE, 1.0)
+    return min(max(TV_OF_NOISE * (problem.noise / change_ratio) ** 2 / pixels, settings.tv_least), TV_MOST)
 
 
 def tv_size(settings: FitSettings, grid: Grid) -> int:

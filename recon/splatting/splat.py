@@ -43,10 +43,10 @@ def project(
     chosen = geometry if views is None else geometry.select(views)
     g = turned_by_rows(gaussians, chosen, -1)
     chosen = chosen.at_row(0)
-    cut = truncation or Truncation()
+    cutoff = truncation or Truncation()
     # line integral at which footprints are cut off
-    faint = cut.faint * g.density_unit * chosen.sample_pitch * chosen.detector_shape[1]
-    return Project.apply(*_raw(g), chosen, (faint, cut.sigmas, model or RayModel()))
+    faint = cutoff.faint * g.density_unit * chosen.sample_pitch * chosen.detector_shape[1]
+    return Project.apply(*_raw(g), chosen, (faint, cutoff.sigmas, model or RayModel()))
 
 
 def voxelize(gaussians: Gaussians, grid: Grid, *, truncation: Truncation | None = None) -> Tensor:
@@ -54,8 +54,8 @@ def voxelize(gaussians: Gaussians, grid: Grid, *, truncation: Truncation | None 
     check_arguments(voxelize, locals())
     from recon.splatting.autograd import Voxelize
 
-    cut = truncation or Truncation()
-    return Voxelize.apply(*_raw(gaussians), grid, (cut.faint * gaussians.density_unit, cut.sigmas))
+    cutoff = truncation or Truncation()
+    return Voxelize.apply(*_raw(gaussians), grid, (cutoff.faint * gaussians.density_unit, cutoff.sigmas))
 
 
 def voxel_means(

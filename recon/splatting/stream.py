@@ -112,10 +112,10 @@ class StreamingFit:
             UserWarning: the angles so far look like degrees (at most one warning in a fit).
         """
         check_arguments(StreamingFit.add_views, locals())
-        theta, before = np.atleast_1d(np.asarray(angles, np.float64)), self._stage.views
-        images = checked_views(data, theta, before.template.detector_shape)
+        theta, n_before = np.atleast_1d(np.asarray(angles, np.float64)), self._stage.views
+        images = checked_views(data, theta, n_before.template.detector_shape)
         self._stage = self._stage.followed_by(images, theta)
-        if not look_like_degrees(before.angles, ended=False):  # otherwise this warning was given before
+        if not look_like_degrees(n_before.angles, ended=False):  # otherwise this warning was given before
             warn_of_degrees(self._stage.views.angles, ended=False)
         if isinstance(self._stage, Growing) and theta.size:
             self.unlearnt = _running_mean(self.unlearnt, *self._stage.newest(self.settings))
@@ -260,8 +260,8 @@ def _run(last: Finishing, seconds: float, now: Clock, ends: Callable[[], bool]) 
                 break
 
 
-def _running_mean(before: float, measured: F32, rendered: F32) -> float:
-    """The running mean of ||rendered - measured|| / ||measured|| with one more projection. `before` is NaN if it is the
-    first projection."""
+def _running_mean(last_mean: float, measured: F32, rendered: F32) -> float:
+    """The running mean of ||rendered - measured|| / ||measured|| with one more projection. `last_mean` is NaN if it is
+    the first projection."""
     residual = float(np.linalg.norm(measured - rendered) / max(float(np.linalg.norm(measured)), 1e-30))
-    return (1 - _NEW) * (before if math.isfinite(before) else residual) + _NEW * residual
+    return (1 - _NEW) * (last_mean if math.isfinite(last_mean) else residual) + _NEW * residual

@@ -130,18 +130,20 @@ def place_gaussians(
     fitted = Grid.for_fit(views.template, box, wider=wider is not None)
     coarser = 2 ** max(0, math.ceil(math.log2(math.prod(fitted.shape) / _PLACED_FROM) / 3))
     shape = (fitted.shape[0], *(math.ceil(n / coarser) for n in fitted.shape[1:]))
-    rough = replace(fitted, shape=shape, voxel_size=coarser * fitted.voxel_size)
-    rough = Grid.for_fit(views.template, rough, wider=wider is not None)
+    coarse_grid = replace(fitted, shape=shape, voxel_size=coarser * fitted.voxel_size)
+    coarse_grid = Grid.for_fit(views.template, coarse_grid, wider=wider is not None)
     count = plan.count or default_count(views.template, fitted.voxel_size)
     kernel = plan.settings.kernel
     if known is None or geometry.is_cone:  # the first volume of a cone does not depend linearly on the data
-        volume = first_volume(data, geometry, rough)
+        volume = first_volume(data, geometry, coarse_grid)
         gaussians = place(volume, used, count, rng, kernel=kernel)
     else:
         model, problem = averaged(known.state), known.problem
         rendered: F32 = np.stack(list(fit.renders(model, problem, plan.settings, learnt)))
-        residual = first_volume(data - rendered * problem.scale, geometry, rough)
-        volume = Volume(fit.volume_of(model, rough, views.template, plan.settings).data + residual.data, rough)
+        residual = first_volume(data - rendered * problem.scale, geometry, coarse_grid)
+        volume = Volume(
+            fit.volume_of(model, coarse_grid, views.template, plan.settings).data + residual.data, coarse_grid
+        )
         radius = geometry.reach if wider is None else math.inf
         gaussians = sample_gaussians(volume, count, rng, field_radius=radius, kernel=kernel)
         gaussians = scale_to_data(gaussians, data, geometry)

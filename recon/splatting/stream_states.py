@@ -210,8 +210,8 @@ class Growing:
         """Whether these line integrals differ from the projections `which` by more than a fifth (norm)."""
         changed = total = 0.0
         for view, image in zip(which, images, strict=True):
-            before = self.problem.backend.numpy(self.problem.images[view]) * self.problem.scale
-            changed += float(np.nansum(np.square(image - before, dtype=np.float64)))
+            old_image = self.problem.backend.numpy(self.problem.images[view]) * self.problem.scale
+            changed += float(np.nansum(np.square(image - old_image, dtype=np.float64)))
             total += float(np.nansum(np.square(image, dtype=np.float64)))
         return changed > _OTHERS**2 * total
 
@@ -222,12 +222,12 @@ class Growing:
         After the move the model has double edges. The learning rates rise again, so that the fit can remove them.
         """
         template, state = self.views.template, self.state
-        moved = axis_col - template.axis_col
-        shift = shift_with_axis(self.views.angles, moved * template.sample_pitch)
+        axis_shift = axis_col - template.axis_col
+        shift = shift_with_axis(self.views.angles, axis_shift * template.sample_pitch)
         for parameters in (state.parameters, state.mean):
             if parameters is not None:
                 parameters["means"][:, :2] -= shift
-        remaining = 1 - min(1.0, abs(moved) / _AXIS_ANEW)
+        remaining = 1 - min(1.0, abs(axis_shift) / _AXIS_ANEW)
         return replace(
             self,
             views=self.views.about(axis_col),
@@ -241,31 +241,31 @@ class Growing:
         """
         if self.views.n < _GROWTH * self.round_views:
             return self
-        young = self.views.n < _YOUNG and self.state.step >= HALF
-        return self._placed_again(plan, young=young, final=False)._with_room(plan, final=False)
+        is_early = self.views.n < _YOUNG and self.state.step >= HALF
+        return self._placed_again(plan, is_early=is_early, final=False)._with_room(plan, final=False)
 
     def completed(self, plan: StreamPlan) -> Growing:
         """The model for the final fit. It may have all Gaussians, and starts from the running mean of the parameters,
         which is better than the latest parameters."""
-        model = self._placed_again(plan, young=False, final=True)._with_room(plan, final=True)
+        model = self._placed_again(plan, is_early=False, final=True)._with_room(plan, final=True)
         if model.state.mean is not None:
             model.state.parameters = {name: values + 0 for name, values in model.state.mean.items()}
         return replace(model, unseen=())
 
-    def _placed_again(self, plan: StreamPlan, young: bool, final: bool) -> Growing:
-        """The model with all Gaussians placed again, if it is `young` (many steps with few projections) or if the first
-        projections were empty; otherwise the same model."""
+    def _placed_again(self, plan: StreamPlan, is_early: bool, final: bool) -> Growing:
+        """The model with all Gaussians placed again, if it is `is_early` (many steps with few projections) or if the
+        first projections were empty; otherwise the same model."""
         # Either the sample or the beam came later, so that the density unit was computed from noise; or there were too
         # few projections.
         problem = self.problem
         blind = max(float(image.max()) for image in problem.images) > _BLIND
-        if not (blind or young):
+        if not (blind or is_early):
             return self
         views = zip(problem.projections, problem.weights, strict=True)
         images = [view if w is None else np.where(w == 0, np.float32(np.nan), view) for view, w in views]
         known = None if blind else Placement(problem, self.state)
-        again = place_gaussians(self.views, images, plan, self.state.rng, all_views=final, known=known)
-        return Growing.of(self.views, again)
+        placement = place_gaussians(self.views, images, plan, self.state.rng, all_views=final, known=known)
+        return Growing.of(self.views, placement)
 
     def _with_room(self, plan: StreamPlan, final: bool) -> Growing:
         """The model, allowed to have more Gaussians. The steps draw from all projections that have arrived.
@@ -273,8 +273,10 @@ class Growing:
         Early projections span a narrow angle and would use all Gaussians for streaks. So a round adds only a part of
         the Gaussians.
         """
-        most = round(self.placed * growth(plan.settings))
-        self.state.limit = most if final else min(most, self.state.n + round(_ROUND_GROWTH * self.placed))
+        most_gaussians = round(self.placed * growth(plan.settings))
+        self.state.limit = (
+            most_gaussians if final else min(most_gaussians, self.state.n + round(_ROUND_GROWTH * self.placed))
+        )
         self.state.drawn = []
         return replace(self, round_views=self.views.n)
 
@@ -282,8 +284,8 @@ class Growing:
         """The state after one more step. The step uses a projection that no step has used, if there is one."""
         state = self.state
         if len(state.drawn) < settings.views_per_step:
-            drawn = state.rng.permutation(self.views.n)
-            state.drawn = drawn[~self.views.held_out[drawn]].tolist()
+            shuffled = state.rng.permutation(self.views.n)
+            state.drawn = shuffled[~self.views.held_out[shuffled]].tolist()
         view = self.unseen[0] if self.unseen else next_view(self.views.n, state.rng)
         if view is not None and self.views.held_out[view]:
             view = None
@@ -310,8 +312,8 @@ class Growing:
 
     def preview(self, plan: StreamPlan) -> BetterVolume:
         """The volume that predicts held-out projections better: the model, or FBP of the projections so far."""
-        apart = np.flatnonzero(self.views.held_out).tolist()
-        return BetterVolume.of(averaged(self.state), self.problem, plan.settings, plan.grid, apart)
+        held_out = np.flatnonzero(self.views.held_out).tolist()
+        return BetterVolume.of(averaged(self.state), self.problem, plan.settings, plan.grid, held_out)
 
     def progress(self, seconds: float) -> Progress:
         """The progress: the steps made so far, and the seconds since the beginning of the fit."""

@@ -96,9 +96,9 @@ def finish_within(seconds: float, seconds_after_steps: float, geometry: Geometry
     full_seconds, available = setup_seconds + FINISH_SWEEPS * sweep, seconds
     if choice_seconds:  # otherwise there are too few projections to hold some out, and PnP-DCT is not tried
         trials_of_patches = EARLY_CHOICE_SWEEPS + TRIAL_SWEEPS + TRIALS * patches.trial_steps
-        refused = sum(each.refused_sweeps for each in pull_methods(iterations=PULLED_SWEEPS))
+        rejected_sweeps = sum(each.refused_sweeps for each in pull_methods(iterations=PULLED_SWEEPS))
         full_seconds += (
-            patches.iterations * sweep + choice_seconds * (trials_of_patches + refused) / EARLY_CHOICE_SWEEPS
+            patches.iterations * sweep + choice_seconds * (trials_of_patches + rejected_sweeps) / EARLY_CHOICE_SWEEPS
         )
         available = min(seconds, seconds_after_steps)
     if full_seconds <= available:
@@ -173,15 +173,15 @@ class FinalFit(Iterative):
         tell(self.fit.finish(max(end - plan.seconds - control.now(), 0.0), on_progress))
         volume, gaussians, reached, sweeps = self.fit.snapshot(problem.grid), self.fit.gaussians, history[-1], 0
         if plan.sweeps != 0 and gaussians is not None and not stop():
-            late = replace(control.by(end), decide=decide, stop_trials=None if plan.trials else lambda: True)
+            limited_control = replace(control.by(end), decide=decide, stop_trials=None if plan.trials else lambda: True)
             if problem.wide:
                 # Gaussians from a fit during the scan do not determine the offset in the middle: -2 dB on grains.
-                refined = FistaTv(half_voxels=False).run(problem, late)  # as its memory is stated
+                refined = FistaTv(half_voxels=False).run(problem, limited_control)  # as its memory is stated
                 volume, sweeps = refined.volume, len(refined.history)
                 decide.settings[REFINEMENT] = FistaTv.name
                 plan = plan._replace(sweeps=self.method.finish)
             else:
-                volume, sweeps = finish(volume, gaussians, problem, plan.sweeps, self.fit.settings, late)
+                volume, sweeps = finish(volume, gaussians, problem, plan.sweeps, self.fit.settings, limited_control)
         # The time limit may also cut PnP-DCT steps, which the number of iterations does not show.
         finished = plan.sweeps == self.method.finish and (sweeps == plan.sweeps or control.now() < end)
         if not ((finished and reached.step >= reached.steps) or stop.stopped):

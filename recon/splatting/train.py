@@ -44,9 +44,9 @@ from recon.splatting.time_limit import (
 )
 from recon.voxels.residuals import residuals_of
 
-_TIMED = 3  # number of steps after which the time of a fit is planned
+_TIMED_STEPS = 3  # number of steps after which the time of a fit is planned
 _LOOK = 50  # number of steps between two measurements in held-out projections
-_PATIENCE = 0.2  # share of the planned steps that may pass without a better model, but at least six measurements
+_PATIENCE_SHARE = 0.2  # share of the planned steps that may pass without a better model, but at least six measurements
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +182,7 @@ class _Run:
     @property
     def stopped_falling(self) -> bool:
         """Whether the residual in held-out projections no longer falls."""
-        patience = max(6 * _LOOK, _PATIENCE * (self.length.steps or 0))
+        patience = max(6 * _LOOK, _PATIENCE_SHARE * (self.length.steps or 0))
         return self.state.step - self.tracker.best_step > patience
 
     def model(self) -> tuple[Volume, Gaussians]:
@@ -284,7 +284,7 @@ def _steps(run: _Run) -> None:
             break
         fit.step(state, run.fitting, run.settings, length.fraction(state.step, spent))
         done += 1
-        if done >= _TIMED and length.seconds is not None:
+        if done >= _TIMED_STEPS and length.seconds is not None:
             _pace(run, length.seconds, now() - begin, done)
         if (
             state.step % _LOOK == _LOOK - 1
@@ -307,7 +307,7 @@ def _pace(run: _Run, seconds: float, spent: float, done: int) -> None:
     `done` steps."""
     length, state = run.length, run.state
     remaining, step = seconds - spent, spent / done
-    if not length.planned and done == _TIMED:
+    if not length.planned and done == _TIMED_STEPS:
         length.plan(FinishPlan(*run.decide("finish", partial(_finish_in_time, run, remaining, step))), spent)
         assert length.seconds is not None
         remaining = length.seconds - spent
@@ -344,8 +344,8 @@ def _finish_in_time(run: _Run, remaining: float, step: float) -> FinishPlan:
 
 def _predicts_worse(finished: Volume, fitted: Volume, unseen: Views) -> bool:
     """Whether the refinement increased the residual in held-out projections by more than 0.1 dB."""
-    after, before = (np.square(residuals_of(volume, unseen)).mean() for volume in (finished, fitted))
-    return bool(after > 10 ** (0.1 / 10) * before)
+    square_after, square_before = (np.square(residuals_of(volume, unseen)).mean() for volume in (finished, fitted))
+    return bool(square_after > 10 ** (0.1 / 10) * square_before)
 
 
 def _resumed(checkpoint: Mapping[str, NDArray[Any]], n_views: int, backend: Backend[Any]) -> FitState:

@@ -45,9 +45,9 @@ def predict(method: Fit, trial: Trial, so_far: TrialChoice, prior: Prior) -> Pre
     would cost 1.3 dB.
     """
     begin = trial.settings.now()
-    tried = _Fit.of(method, trial, FIRST_SHARE)
+    fit = _Fit.of(method, trial, FIRST_SHARE)
     smooth, best = trial.smooth_residuals, so_far.best_residuals
-    residuals, remark = tried.refined(prior), ""
+    residuals, remark = fit.refined(prior), ""
     leads = best is None or significantly_better(trial.in_line_integrals(residuals), best, so_far.least_gain)
     if so_far.least_gain > 0 and not leads and significantly_better(smooth, residuals, FAR_BEHIND):
         remark = (
@@ -56,10 +56,10 @@ def predict(method: Fit, trial: Trial, so_far: TrialChoice, prior: Prior) -> Pre
             "--quality best runs it)"
         )
     elif not leads:
-        tried = _Fit.of(method, trial, 1.0)
-        residuals = tried.refined(prior)
-    apart = tried.level_beyond > residuals.mean()
-    return trial.prediction(method.name, residuals, None if apart else prior, remark)
+        fit = _Fit.of(method, trial, 1.0)
+        residuals = fit.refined(prior)
+    is_level_apart = fit.level_beyond > residuals.mean()
+    return trial.prediction(method.name, residuals, None if is_level_apart else prior, remark)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +91,10 @@ class _Fit:
         model, box = fit.gaussians, fit.volume.grid
         assert isinstance(model, Gaussians)
 
-        cut = reach_of(views.views).is_cut_by(box, views.geometry)
+        is_cut = reach_of(views.views).is_cut_by(box, views.geometry)
 
         def beyond(geometry: Geometry) -> F32 | None:
-            lines = beyond_voxels(model, geometry, box, method.fit) if cut else None
+            lines = beyond_voxels(model, geometry, box, method.fit) if is_cut else None
             if lines is None:
                 return None
             return times_power(np.ascontiguousarray(projection_lines(lines)[:, cols]), -units.integral)
