@@ -163,15 +163,15 @@ class Instrument:
         if not live and config.scan.decide != "off" and self._say is not None:
             self._say(NO_DECISIONS.format(config.scan.decide))
         config = config if live else changed(config, NO_LIVE)
-        how = commands_of(config) if live else Commands()
-        if how.remark and self._say is not None:
-            self._say(how.remark)
+        commands = commands_of(config) if live else Commands()
+        if commands.remark and self._say is not None:
+            self._say(commands.remark)
         try:
             with stop_signals(stop):
                 run_scan(
                     config, None if output is None else Path(output),
                     [remember, say, *([on_event] if on_event else [])], stop,
-                    live=how, instrument=self._devices,
+                    live=commands, instrument=self._devices,
                 )  # fmt: skip
         finally:
             self.last = _result(ends)

@@ -164,8 +164,8 @@ class _Frames(DetectorAcquireLogic):
                 angle = math.nan
                 if by_software:
                     angle = math.nan if devices.stage.moving() else devices.stage.position()
-                    while (left := triggered + period - self._clock.now()) > 0 and not self._stop.is_set():
-                        self._clock.sleep(min(left, LOOK_EVERY))
+                    while (seconds_left := triggered + period - self._clock.now()) > 0 and not self._stop.is_set():
+                        self._clock.sleep(min(seconds_left, LOOK_EVERY))
                     if self._stop.is_set():
                         return
                     camera.software_trigger()

@@ -92,8 +92,8 @@ class TomoScan(Device):
             return
         try:
             # a disk that does not respond must not block the RunEngine
-            asked = await asyncio.to_thread(ask, self._folder, verb)
-            while await asyncio.to_thread(asked.state) is None:  # an end of the plan need not wait for it
+            answer = await asyncio.to_thread(ask, self._folder, verb)
+            while await asyncio.to_thread(answer.state) is None:  # an end of the plan need not wait for it
                 await asyncio.sleep(POLL)
         except ConfigError:
             takes = self._task is not None and not self._task.done()

@@ -57,8 +57,8 @@ class _Messages:
             case "input" | "pause", _:
                 self.needs.append(ScanNeeds(operator=(OperatorRequest("answer the plan, or resume it", 1),)))
             case "locate", Rotation() as stage:
-                at = math.degrees(self.places.get(stage, stage.radians))
-                return {"setpoint": at, "readback": at}
+                degrees = math.degrees(self.places.get(stage, stage.radians))
+                return {"setpoint": degrees, "readback": degrees}
             case "kickoff" | "complete" | "wait", _:
                 pass
             case _:
@@ -66,9 +66,9 @@ class _Messages:
         return _DONE
 
     def _move(self, stage: Rotation, target: float) -> None:
-        limits, at = stage.limits, self.places.get(stage, stage.radians)
+        limits, position = stage.limits, self.places.get(stage, stage.radians)
         self.places[stage] = target
-        self.needs.append(ScanNeeds({"move": move_seconds(target - at, limits.max_speed, limits.acceleration)}))
+        self.needs.append(ScanNeeds({"move": move_seconds(target - position, limits.max_speed, limits.acceleration)}))
         if not limits.low <= target <= limits.high:
             reach = f"{degrees(limits.low)} ... {degrees(limits.high)}"
             self.faults.append(
@@ -77,14 +77,14 @@ class _Messages:
 
     def _expose(self, camera: CameraDetector) -> None:
         """Add the frames of a trigger. Their number is that for which the camera was prepared last."""
-        config, asked = camera.config, self.values.get(id(camera))
-        exposure = getattr(asked, "livetime", 0.0) or config.scan.exposure_s
+        config, requested = camera.config, self.values.get(id(camera))
+        exposure = getattr(requested, "livetime", 0.0) or config.scan.exposure_s
         timing = config.devices.camera.timing_of(camera_settings(config, exposure, TriggerSource.SOFTWARE))
-        n = getattr(asked, "number_of_exposures", 1)
-        apart = max(timing.min_period, exposure + getattr(asked, "deadtime", 0.0))
+        n = getattr(requested, "number_of_exposures", 1)
+        period = max(timing.min_period, exposure + getattr(requested, "deadtime", 0.0))
         kind = ShownFrames(self.values.get(id(camera.kind), ShownFrames.PROJECTION))
         size = row_bytes(timing.shape, config.storage.preview_bin)
-        self.needs.append(ScanNeeds({kind.value: n * apart}, n, n * size))
+        self.needs.append(ScanNeeds({kind.value: n * period}, n, n * size))
         self.sample, self.disk = config.sample.name, disk_of(camera.runs)
 
 
@@ -113,14 +113,15 @@ def scans_of(plan: Generator[Any, Any, Any]) -> tuple[PlannedScan, ...]:
     except ConfigError as error:
         others.faults.append(ScanFault(str(error)))
     except Exception as error:  # an error of the plan, because it got no measured values
-        what = f"{type(error).__name__}: {error}"
+        error_text = f"{type(error).__name__}: {error}"
         others.faults.append(
             ScanFault(
-                f"the plan cannot be predicted, because the plan raises an error if it gets no measured values ({what})"
+                f"the plan cannot be predicted, because the plan raises an error if it gets no measured values "
+                f"({error_text})"
             )
         )
     if others.needs or others.faults:
-        rest = f"{source}, other messages" if scans else source
+        source_text = f"{source}, other messages" if scans else source
         needs = all_needs(others.needs)
-        scans.append(PlannedScan(rest, others.sample, tuple(others.faults), needs=needs, disk=others.disk))
+        scans.append(PlannedScan(source_text, others.sample, tuple(others.faults), needs=needs, disk=others.disk))
     return tuple(scans)

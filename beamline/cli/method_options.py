@@ -95,8 +95,8 @@ def refuse_other_methods(command: click.Command, given_names: Collection[str], m
             return  # checked before the other methods are asked, because they load torch
     owners = {name: takers(param) for name, param in given_params.items()}
     for name in (name for name, methods in owners.items() if method not in methods):
-        what = f"it cannot be combined with --method {method}." if stated else _instead(name, owners)
-        raise click.UsageError(f"--{name} works only with {', '.join(owners[name])}; {what}")
+        advice = f"it cannot be combined with --method {method}." if stated else _instead(name, owners)
+        raise click.UsageError(f"--{name} works only with {', '.join(owners[name])}; {advice}")
 
 
 def _instead(name: str, owners: Mapping[str, Sequence[str]]) -> str:

@@ -115,8 +115,8 @@ def _in_lines(file: Path, watched: _Watched) -> list[str]:
 
     summed = watched.verdict
     end = f"{one_line(str(file), SENTENCE)}: {summed.n_frames} frames, flagged: {counted(summed.flags)}"
-    if again := summed.retaken:
-        end += f"; not counted, because the scan took these projections again: {frames_text(again)}"
+    if retaken := summed.retaken:
+        end += f"; not counted, because the scan took these projections again: {frames_text(retaken)}"
     altered = [summed.altered] if summed.altered else []
     left_out = [f"Not checked: {'; '.join(summed.aside)}."] if summed.aside else []
     return [*table(summed.kinds), *summed.references, *altered, *left_out, *watched.ended, end]
@@ -176,15 +176,15 @@ def table(kinds: Iterable[FlagKind]) -> list[str]:
     units, lines = {check.name: check.unit for check in CHECKS}, []
     for kind in kinds:
         worst = kind.worst
-        where = ""
+        region_text = ""
         if worst.region is not None:
             top, bottom, left, right = worst.region
-            where = f", rows {top}-{bottom - 1}, columns {left}-{right - 1}"
+            region_text = f", rows {top}-{bottom - 1}, columns {left}-{right - 1}"
         unit_text = units[kind.check]
         lines += [
             f"{kind.level:<6}{kind.check:<12}{count(len(kind.frames), 'frame')}: {spans(kind.frames)}",
             f"{'':<18}worst score {worst.score:.4g} (limit {worst.limit:.4g} {unit_text}), in frame "
-            f"{worst.frame}{where}",
+            f"{worst.frame}{region_text}",
             f"{'':<18}{worst.advice}",
         ]
     return lines

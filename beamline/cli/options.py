@@ -175,8 +175,8 @@ def refuse_contradictions(
         if name not in given_names:
             continue
         for excluded in (excluded for excluded in param.excludes if excluded in given_names):
-            why = f"{shown.get(excluded, f'--{excluded}')}: {param.excludes[excluded]}"
-            raise click.UsageError(f"--{name} cannot be combined with {why}. Nothing was computed.")
+            reason = f"{shown.get(excluded, f'--{excluded}')}: {param.excludes[excluded]}"
+            raise click.UsageError(f"--{name} cannot be combined with {reason}. Nothing was computed.")
         if param.needs is not None and param.needs[0] not in given_names:
             raise click.UsageError(f"--{name} {param.needs[1]}")
 
@@ -208,9 +208,9 @@ dataset_option = option(
 
 def new_folder_option(default: str) -> Decorator:
     """Option -o of a command that writes several files; `default` describes the folder used without the option."""
-    where = click.Path(path_type=Path, file_okay=False)
+    path_type = click.Path(path_type=Path, file_okay=False)
     return option(
-        "-o", "--output", type=where, help=f"New folder for the results. Default: {default}, in the current folder."
+        "-o", "--output", type=path_type, help=f"New folder for the results. Default: {default}, in the current folder."
     )
 
 

@@ -136,8 +136,8 @@ def _read(path: Path) -> Mapping[str, Any]:
     try:
         text = _text(path)
     except (OSError, UnicodeDecodeError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise click.BadParameter(f"{path} cannot be read ({why})") from error
+        reason = getattr(error, "strerror", None) or error
+        raise click.BadParameter(f"{path} cannot be read ({reason})") from error
     from beamline.config.tree import yaml_faults  # imported here because it loads pydantic
 
     with yaml_faults(text, str(path)):

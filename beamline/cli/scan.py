@@ -294,14 +294,14 @@ def run_one(
     from beamline.scan.live_process import Commands, commands_of
     from beamline.scan.run import run_scan
 
-    stop, how = stop or StopRequest(), commands_of(config, series) if not request.no_live else Commands()
-    if how.remark:
-        click.echo(how.remark, err=True)
+    stop, commands = stop or StopRequest(), commands_of(config, series) if not request.no_live else Commands()
+    if commands.remark:
+        click.echo(commands.remark, err=True)
     with _shown(request, others, stop) as (sinks, ask):
         if request.documents is not None:
             sinks.append(import_module("beamline.bluesky.documents").sink(config, request.documents, held))
         place = series or request.output
-        return run_scan(config, place, sinks, stop, live=how, ask=ask)
+        return run_scan(config, place, sinks, stop, live=commands, ask=ask)
 
 
 def _config_of_series(config: Config | None, run: Path | None, documents: str | None) -> Config | None:
@@ -360,9 +360,9 @@ def faults_of(result: RunResult) -> list[str]:
     words = []
     if result.alarmed_frames:
         verb = "has" if result.alarmed_frames == 1 else "have"
-        again = f" (not counting {count(result.retaken, 'projection')} taken again)" if result.retaken else ""
+        retaken_text = f" (not counting {count(result.retaken, 'projection')} taken again)" if result.retaken else ""
         words.append(
-            f"{result.alarmed_frames} of {result.n_frames} frames {verb} an alarm of the monitor{again}: "
+            f"{result.alarmed_frames} of {result.n_frames} frames {verb} an alarm of the monitor{retaken_text}: "
             f"{counted(result.flags)}."
         )
     if result.alarmed_views and (treated := _treated(result.path)):

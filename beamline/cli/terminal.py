@@ -127,13 +127,13 @@ class Terminal:
             case FrameStored(n, of):
                 self._show("scan", n, of, rates(event))
             case Counted(stage, n, of):
-                what, counted = _COUNTED.get(stage, (stage, stage))
-                self._show(what, n, of, rate_text(event, counted))
+                counted_name, counted = _COUNTED.get(stage, (stage, stage))
+                self._show(counted_name, n, of, rate_text(event, counted))
             case PhaseReached(_, counted, phase, n, of) if n or not self._bar.disable:
                 self._show(phase, n, of, rate_text(event, counted))
             case TrialReached(stage, n, of):
-                what = in_folders("beamline.features", "COUNTED").get(stage, "trials")
-                self._show(what, n, of, trials(event, what))
+                counted_name = in_folders("beamline.features", "COUNTED").get(stage, "trials")
+                self._show(counted_name, n, of, trials(event, counted_name))
             case KernelsCompiled(_, n, seconds):
                 self._show(
                     "kernels",
@@ -309,14 +309,14 @@ def _ended(settings: Mapping[str, Any]) -> str:
         "stopped": "stopped after {} iterations, before the volume had converged",
         "bound": "ended after {} iterations, before the volume had converged (a larger --iterations allows more)",
     }
-    how, done = settings.get("ended"), settings.get("ended_after")
+    reason, done = settings.get("ended"), settings.get("ended_after")
     last_change = settings.get("last_change")
     change = (
         ""
-        if how == "still" or last_change is None
+        if reason == "still" or last_change is None
         else f"; the last four iterations changed the volume by {last_change:.2%}"
     )
-    return words[how].format(done) + change if how in words else ""
+    return words[reason].format(done) + change if reason in words else ""
 
 
 def _metrics_of(record: ReconRecord) -> list[str]:
@@ -374,6 +374,6 @@ class PageBeside:
             return lambda text: None
 
     def _pass_on(self, line: str) -> None:
-        what, _, address = line.strip().partition(" ")
-        if what in (LOOK, ACT):
-            self._say(f"Page to {what} the scan: {address.strip()}")
+        first_word, _, address = line.strip().partition(" ")
+        if first_word in (LOOK, ACT):
+            self._say(f"Page to {first_word} the scan: {address.strip()}")

@@ -66,8 +66,10 @@ def _triggers(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
     for key, fit in _ONE_FRAME_A_PULSE.items():
         if (value := getattr(camera, key)) not in fit:
             expected = f"expected {' | '.join(map(str, fit))}, or scan.mode: step"
-            what = f"devices.camera.{key} {value} does not give one frame per pulse, which a fly scan needs; {expected}"
-            yield ("devices", "camera", key), what
+            fault = (
+                f"devices.camera.{key} {value} does not give one frame per pulse, which a fly scan needs; {expected}"
+            )
+            yield ("devices", "camera", key), fault
     width = stage.settings.pulse_width
     if camera.trigger_active == "level" and (width is None or abs(width - scan.exposure_s) > 0.01 * scan.exposure_s):
         yield (

@@ -207,7 +207,7 @@ def _checked(tree: Tree, name: str) -> ReadConfig:
     except ValidationError as error:
         _refuse(name, explain(error, tree, schema()))
         raise
-    return ReadConfig(config, tree, [(tree.origin(keys), what) for keys, what in faults(config, config_folder())])
+    return ReadConfig(config, tree, [(tree.origin(keys), fault) for keys, fault in faults(config, config_folder())])
 
 
 def _refuse(path: str, faults_found: Sequence[tuple[str, str]]) -> None:

@@ -366,9 +366,9 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _filter_is_there(self) -> Self:
-        named, there = self.scan.filter, list(self.devices.filter.places)
-        if named is not None and named not in there:
-            legal = f"devices.filter has {', '.join(there)}" if there else "devices.filter has no places"
+        named, known_names = self.scan.filter, list(self.devices.filter.places)
+        if named is not None and named not in known_names:
+            legal = f"devices.filter has {', '.join(known_names)}" if known_names else "devices.filter has no places"
             raise ValueError(f"scan.filter {named!r} is not one of the filter's places; {legal}")
         return self
 
@@ -446,8 +446,8 @@ class Config(Section):
                 f"devices.monochromator.kind to the type of your monochromator, or set {name} to null"
             )
         low, high = getattr(device, "range_kev", None) or (0.0, math.inf)
-        if beyond := [energy for energy in energies if not low <= energy <= high]:
-            bad_energy = beyond[0]
+        if out_of_reach := [energy for energy in energies if not low <= energy <= high]:
+            bad_energy = out_of_reach[0]
             raise ValueError(
                 f"{name}: {bad_energy:.7g} keV is not within devices.monochromator.range_kev {low:g} ... {high:g}"
             )

@@ -173,9 +173,9 @@ def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
     mark, context = getattr(error, "problem_mark", None), getattr(error, "context_mark", None)
     problem = str(getattr(error, "problem", None) or " ".join(str(error).split()) or type(error).__name__)
     if isinstance(error, yaml.reader.ReaderError):
-        at = error.position
-        code = ord(text[at])
-        return text.count("\n", 0, at) + 1, f"the character U+{code:04X} is not allowed in text; remove it"
+        position = error.position
+        code = ord(text[position])
+        return text.count("\n", 0, position) + 1, f"the character U+{code:04X} is not allowed in text; remove it"
     if mark is None:
         return 0, problem if isinstance(error, yaml.YAMLError) else _TAGGED
     lines = [*text.split("\n"), ""]
@@ -216,8 +216,8 @@ def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
             "the indentation of this line does not match the indentation of any group above this line",
         ),
     )
-    at = context if (is_open or is_quote) and context else mark
-    return at.line + 1, next((sentence for holds, sentence in faults if holds), problem)
+    position = context if (is_open or is_quote) and context else mark
+    return position.line + 1, next((sentence for holds, sentence in faults if holds), problem)
 
 
 def _locate(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]) -> None:

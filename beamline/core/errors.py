@@ -129,14 +129,14 @@ def is_defect(error: BaseException) -> bool:
 def user_message(error: BaseException) -> str:
     """The message of `error` for the operator."""
     if out_of_memory(error):
-        what = " ".join(str(error).split()) or "no details"
+        details = " ".join(str(error).split()) or "no details"
         return (
-            f"Out of memory ({what}). Use fewer --rows or --views, a larger --bin, or a smaller --memory (the "
+            f"Out of memory ({details}). Use fewer --rows or --views, a larger --bin, or a smaller --memory (the "
             "volume is then made in slabs). No incomplete result was kept, and existing files were not changed."
         )
     if isinstance(error, OSError) and error.strerror:
-        where = "" if error.filename is None else f"{error.filename}: "
-        return f"{where}{error.strerror}. Check the path, the permissions and the disk."
+        file_text = "" if error.filename is None else f"{error.filename}: "
+        return f"{file_text}{error.strerror}. Check the path, the permissions and the disk."
     if damaged(error):
         hdf5_reason = str(error).strip(chr(39))
         return f"The file is damaged: HDF5 says {hdf5_reason!r}. Use a copy of the file, or the original."
@@ -145,8 +145,8 @@ def user_message(error: BaseException) -> str:
     if not isinstance(error, BeamlineError | DeviceError) and (problem := installation_problem(error)):
         return problem
     if is_defect(error):
-        what = " ".join(str(error).split()) or "Python states no reason"
-        return f"a defect in this program: {type(error).__name__}: {what}"
+        details = " ".join(str(error).split()) or "Python states no reason"
+        return f"a defect in this program: {type(error).__name__}: {details}"
     return str(error) or repr(error)
 
 

@@ -87,8 +87,8 @@ def require_regular(path: Path, largest: float = math.inf) -> None:
     except FileNotFoundError:
         return
     if not stat.S_ISREG(status.st_mode):
-        what = "It is a folder" if stat.S_ISDIR(status.st_mode) else "It is a device or a pipe"
-        raise OSError(errno.EINVAL, f"{what}, but a regular file is expected", str(path))
+        kind_text = "It is a folder" if stat.S_ISDIR(status.st_mode) else "It is a device or a pipe"
+        raise OSError(errno.EINVAL, f"{kind_text}, but a regular file is expected", str(path))
     if status.st_size > largest:
         raise OSError(errno.EFBIG, f"The file is too large ({status.st_size} bytes, at most {largest:.0f})", str(path))
 
@@ -109,9 +109,11 @@ def refuse_substitute(path: Path) -> None:
     to the data, or a web page."""
     with path.open("rb") as file:
         head = file.read(64).lower()
-    why = "empty" if not head else next((why for begin, why in _SUBSTITUTES.items() if head.startswith(begin)), "")
-    if why and not path.name.lower().endswith(".nii.gz"):  # a volume, which can be read in its compressed form
-        raise DataError(f"{path} is {why}. Nothing was read.")
+    reason = (
+        "empty" if not head else next((reason for begin, reason in _SUBSTITUTES.items() if head.startswith(begin)), "")
+    )
+    if reason and not path.name.lower().endswith(".nii.gz"):  # a volume, which can be read in its compressed form
+        raise DataError(f"{path} is {reason}. Nothing was read.")
 
 
 def kind_of_data(path: Path) -> str | None:
@@ -221,11 +223,11 @@ def refuse_existing(path: Path) -> None:
     A result never replaces anything, not even a broken link, and the folder must exist.
     """
     longest = os.pathconf(path.parent, "PC_NAME_MAX") if hasattr(os, "pathconf") and path.parent.is_dir() else 255
-    if len(os.fsencode(path.name)) > (most := longest - _BESIDE):
+    if len(os.fsencode(path.name)) > (longest_name := longest - _BESIDE):
         n_bytes = len(os.fsencode(path.name))
         raise DataError(
-            f"{path}: the name is too long: {n_bytes} bytes, at most {most} are allowed, because the program also "
-            "writes files with longer names next to it (temporary files, the report). Use a shorter name. Nothing "
+            f"{path}: the name is too long: {n_bytes} bytes, at most {longest_name} are allowed, because the program "
+            "also writes files with longer names next to it (temporary files, the report). Use a shorter name. Nothing "
             "was written."
         )
     if link := broken_link(path):

@@ -155,7 +155,7 @@ def _free_in_cgroups(root: Path, own: Path) -> Iterator[int]:
     lines: list[str] = []
     with suppress(OSError):
         lines = own.read_text(encoding="utf-8", errors="replace").splitlines()
-    for pattern, tree, most, now, cache in (_CGROUP_2, _CGROUP_1):
+    for pattern, tree, limit_file, usage_file, cache in (_CGROUP_2, _CGROUP_1):
         top = root / tree
         folder = top / next((match[1] for line in lines if (match := re.fullmatch(pattern, line))), "")
         for place in (folder, *folder.parents):
@@ -163,7 +163,7 @@ def _free_in_cgroups(root: Path, own: Path) -> Iterator[int]:
                 break
             # without a limit, the value is the word "max", or more than the memory of the machine
             with suppress(OSError, ValueError):
-                limit, used = (int((place / name).read_text("ascii")) for name in (most, now))
+                limit, used = (int((place / name).read_text("ascii")) for name in (limit_file, usage_file))
                 yield max(limit - used + _entry(place / "memory.stat", cache), 0)
 
 

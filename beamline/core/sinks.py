@@ -54,16 +54,16 @@ def sentence(event: Event) -> str | None:
         case BlockDone():
             return _missing(event)
         case FrameFlagged(flag):
-            where = "frame" if len(flag.frames) == 1 else f"{len(flag.frames)} frames, {flag.frames.start} to"
-            return f"{flag.level.capitalize()} ({flag.check}, {where} {flag.frame}): {flag.advice}"
+            frames_text = "frame" if len(flag.frames) == 1 else f"{len(flag.frames)} frames, {flag.frames.start} to"
+            return f"{flag.level.capitalize()} ({flag.check}, {frames_text} {flag.frame}): {flag.advice}"
         case PassEnded():
             return "\n".join(lines(event))
         case NextChosen():
             return _decision(event)
         case ScanDone(scan):
             alarms = f", {scan.alarmed_frames} WITH AN ALARM" if scan.alarmed_frames else ""
-            again = f", {count(scan.retaken, 'projection')} taken again" if scan.retaken else ""
-            head = f"Scan {scan.status}: {scan.n_frames} frames{again}{alarms}, {size(scan.bytes)}"
+            retaken_text = f", {count(scan.retaken, 'projection')} taken again" if scan.retaken else ""
+            head = f"Scan {scan.status}: {scan.n_frames} frames{retaken_text}{alarms}, {size(scan.bytes)}"
             return f"{head}, {scan.seconds:.1f} s: {scan.path}"
         case Failed(message):
             return f"Failed: {message}"
@@ -76,9 +76,9 @@ def _of_reconstruction(event: Event) -> str | None:
     """The sentence of an event of `recon_events`."""
     match event:
         case ReconStarted():
-            again = "starts again from the beginning" if event.again else "starts"
+            start_text = "starts again from the beginning" if event.again else "starts"
             views = count(event.n_views, "projection")
-            return f"{event.method} {again}: {views}, rotation axis at column {event.axis_col:.2f}"
+            return f"{event.method} {start_text}: {views}, rotation axis at column {event.axis_col:.2f}"
         case TrialsStarted(file, trials=trials, by=by):
             return f"Starting {count(trials, 'trial')} of {file}; the quality of each volume is measured by {by}"
         case TrialDone():
@@ -258,11 +258,11 @@ def while_it_works(sink: Sink, others: Sink) -> Sink:
             if isinstance(error, KeyboardInterrupt) and threading.current_thread() is threading.main_thread():
                 raise  # Ctrl-C
             works = False
-            why = f"{type(error).__name__}: {error}"
+            reason = f"{type(error).__name__}: {error}"
             others(
                 Warned(
                     "The work continues, but one of the outputs for progress or logs failed and gets no more "
-                    f"messages: {why}",
+                    f"messages: {reason}",
                     time=event.time,
                 )
             )

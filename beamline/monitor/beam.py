@@ -103,8 +103,10 @@ class BeamCheck(Logged):
         level = state.level + (brighter if brighter * moved > CONFIRMED * brighter**2 else 0.0)
         score = -math.expm1(level - state.usual)
         limit = max(self.dip, SIGMAS * state.changes.sigma)
-        most = self.dip / 2
-        state = replace(state, level=level, changes=state.changes.with_figure(min(max(brighter, -most), most)))
+        largest_change = self.dip / 2
+        state = replace(
+            state, level=level, changes=state.changes.with_figure(min(max(brighter, -largest_change), largest_change))
+        )
         if abs(score) <= limit or state.dipping >= PATIENCE:
             usual = level if state.dipping >= PATIENCE else state.usual + MEMORY * (level - state.usual)
             return replace(state, usual=usual, dipping=0), None
@@ -126,12 +128,12 @@ class BeamCheck(Logged):
                 "weaker than in the flats."
             )
             return CheckResult(replace(state, covered=True), Flag(self.name, Level.INFO, row, score, COVERED, advice))
-        gone = state.flagged_drift != 0 and abs(score) < GONE * self.drift
-        if not gone and abs(score) <= max(GROWN * abs(state.flagged_drift), self.drift):
+        has_ended = state.flagged_drift != 0 and abs(score) < GONE * self.drift
+        if not has_ended and abs(score) <= max(GROWN * abs(state.flagged_drift), self.drift):
             return CheckResult(replace(state, drifting=0))
         if state.drifting + 1 < LASTS:
             return CheckResult(replace(state, drifting=state.drifting + 1))
-        if gone:
+        if has_ended:
             return CheckResult(replace(state, drifting=0, flagged_drift=0.0))
         # a drift that continues does not make the projection worse
         level = Level.INFO if state.flagged_drift else Level.WARN
@@ -152,15 +154,15 @@ def in_air(context: ScanContext) -> float:
 
 def _of_integrals(flag: Flag) -> Flag:
     """The flag for a file without counts and flats, for which the intensity is not known."""
-    off = -math.log1p(-flag.score) if flag.score < 1 else math.inf
+    line_integral = -math.log1p(-flag.score) if flag.score < 1 else math.inf
     if flag.limit == COVERED:
         advice = (
-            f"No line integral of the frame is below {off:.3g}: either the sample covers the whole frame, or the line "
-            "integral of air is not 0."
+            f"No line integral of the frame is below {line_integral:.3g}: either the sample covers the whole frame, or "
+            "the line integral of air is not 0."
         )
     else:
         advice = (
-            f"Line integrals are wrong by {off:+.3g}, compared with 0 in air or with the projections before. "
+            f"Line integrals are wrong by {line_integral:+.3g}, compared with 0 in air or with the projections before. "
             f"{TAKEN_OFF}"
         )
     return replace(flag, advice=advice)

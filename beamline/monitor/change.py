@@ -173,11 +173,11 @@ class FrameScatter:
 
     def with_figure(self, figure: float) -> FrameScatter:
         weight = max(MEMORY, 1 / (self.n + 1))
-        away = figure - self.mean
-        if self.ready and abs(away) > OUTLIER * self.deviation:
-            away = OUTLIER * self.deviation if away > 0 else -OUTLIER * self.deviation
+        difference = figure - self.mean
+        if self.ready and abs(difference) > OUTLIER * self.deviation:
+            difference = OUTLIER * self.deviation if difference > 0 else -OUTLIER * self.deviation
         return FrameScatter(
-            self.n + 1, self.mean + weight * away, self.deviation + weight * (abs(away) - self.deviation)
+            self.n + 1, self.mean + weight * difference, self.deviation + weight * (abs(difference) - self.deviation)
         )
 
 

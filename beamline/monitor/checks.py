@@ -45,17 +45,17 @@ def _distinct(*checks: Check) -> tuple[Check, ...]:
 
 def _all(ours: tuple[Check, ...]) -> Registry[Check]:
     """These checks and those of other packages."""
-    found = ours
+    all_checks = ours
 
     def entry(name: str, kind: Callable[[], Check]) -> Check:
-        nonlocal found
+        nonlocal all_checks
         check = kind()
         if check.name != name:
             raise ValueError(
                 f"the class of this check has the name {check.name!r}; expected the name of its entry point"
             )
         _ = check.policy, check.unit, check.meaning, check.start(), fields(check)
-        found = _distinct(*found, check)
+        all_checks = _distinct(*all_checks, check)
         return check
 
     return Registry("check", {check.name: check for check in ours}, entry)

@@ -313,8 +313,12 @@ def _dead(frame: Frame, digest: FrameDigest, context: ScanContext) -> PixelPlace
     above = intensity(digest.preview, context)
     block = math.ceil(frame.counts.shape[1] / above.shape[1])
     dark = digest.preview - above
-    around = scipy.ndimage.minimum_filter(above, 3)  # a dark pixel at the edge of a shadow does not count as dead
-    limit = np.where(around > UNLIT * np.percentile(above[::2, ::2], BRIGHT), dark + DEAD * around, -np.inf)
+    lowest_nearby = scipy.ndimage.minimum_filter(
+        above, 3
+    )  # a dark pixel at the edge of a shadow does not count as dead
+    limit = np.where(
+        lowest_nearby > UNLIT * np.percentile(above[::2, ::2], BRIGHT), dark + DEAD * lowest_nearby, -np.inf
+    )
     counts, cols = frame.counts, frame.counts.shape[1]
     places = [
         row * block * cols + np.flatnonzero(counts[row * block : (row + 1) * block] < np.repeat(line, block)[:cols])

@@ -47,15 +47,15 @@ class Axis:
 
     def with_figure(self, figure: float, sigma: float, pairs: int) -> Axis:
         usual = self.usual.with_figure(figure)
-        most = CLIPPED * max(usual.deviation, 1e-9)
-        away = min(max(figure - usual.mean, -most), most)
+        largest_difference = CLIPPED * max(usual.deviation, 1e-9)
+        difference = min(max(figure - usual.mean, -largest_difference), largest_difference)
         if math.isnan(self.last):
-            return replace(self, usual=usual, last=away)
+            return replace(self, usual=usual, last=difference)
         weight = max(SHAKE_MEMORY, 1 / (pairs + 1))
-        square = self.square + weight * (away**2 - self.square)
-        product = self.product + weight * (away * self.last - self.product)
+        square = self.square + weight * (difference**2 - self.square)
+        product = self.product + weight * (difference * self.last - self.product)
         noise = self.noise + weight * ((sigma / FROM_NOISE) ** 2 - self.noise)
-        return Axis(usual, away, square, product, noise)
+        return Axis(usual, difference, square, product, noise)
 
     def size(self, pairs: int) -> float:
         """Size of the shaking: standard deviation in pixels without the noise; 0 if noise alone can explain it.

@@ -121,16 +121,16 @@ class OppositeCheck(Logged):
             return CheckResult(state)
         if context.cone or not grid.flats:
             cone = "in a cone beam opposite projections differ even if the sample is at rest"
-            why = cone if context.cone else "there are no flats"
-            advice = f"Nothing to do: opposite projections are not compared, because {why}."
+            reason = cone if context.cone else "there are no flats"
+            advice = f"Nothing to do: opposite projections are not compared, because {reason}."
             return CheckResult(
                 replace(state, aside=True), Flag(self.name, Level.INFO, frame.index, 0.0, self.warn, advice)
             )
         waiting = _with_view(state.waiting, view, frame.replaces, follows=context.follows)
         state = replace(state, waiting=waiting)
         for place, earlier in enumerate(waiting):
-            late = earlier.after is not None and view.index - earlier.view.index >= LATER
-            if late and (looked := self._compared(state, place, view, context)) is not None:
+            is_later = earlier.after is not None and view.index - earlier.view.index >= LATER
+            if is_later and (looked := self._compared(state, place, view, context)) is not None:
                 return looked
         return CheckResult(replace(state, waiting=tuple(_with_nearer(earlier, view) for earlier in waiting)))
 
@@ -244,17 +244,17 @@ def _with_view(waiting: tuple[Kept, ...], view: CellView, replaces: int, *, foll
     waiting = tuple(earlier for earlier in waiting if earlier.view.index != replaces)  # the replaced view had an alarm
     if waiting and waiting[-1].after is None:
         return (*waiting[:-1], replace(waiting[-1], after=view)) if follows else waiting[:-1]
-    apart = all(abs(_folded(view.angle - earlier.view.angle)) >= EVERY for earlier in waiting)
-    return (*waiting, Kept(view)) if len(waiting) < MOST and apart else waiting
+    is_apart = all(abs(_folded(view.angle - earlier.view.angle)) >= EVERY for earlier in waiting)
+    return (*waiting, Kept(view)) if len(waiting) < MOST and is_apart else waiting
 
 
 def _with_nearer(earlier: Kept, view: CellView) -> Kept:
     """The kept projection, with the given one as the projection that gives its velocity, if the given one is nearer in
     angle than the present one."""
-    before, away = (
+    distance_before, distance_now = (
         0.0 if each is None else abs(_folded(each.angle - earlier.view.angle)) for each in (earlier.after, view)
     )
-    return replace(earlier, after=view) if (BESIDE - 1) * before < away < before else earlier
+    return replace(earlier, after=view) if (BESIDE - 1) * distance_before < distance_now < distance_before else earlier
 
 
 def _folded(angle: float) -> float:
@@ -310,9 +310,9 @@ def lay_on(earlier: Kept, steps: float, view: CellView, grid: CellGrid, *, mirro
     sigma = math.sqrt(own / SMOOTHER / float(np.diag(normal)[1:][determined].min()))
     # Both projections begin at `first`: after mirroring about the middle of the frame, their columns are at other
     # positions.
-    off = first + last - grid.shape[1] if mirrored else 0
+    offset = first + last - grid.shape[1] if mirrored else 0
     places = 1 + (1 - steps) ** 2 + steps**2
-    return ViewFit((across + off) * grid.cell, down * grid.cell, remainder * grid.cell, sigma * grid.cell, places)
+    return ViewFit((across + offset) * grid.cell, down * grid.cell, remainder * grid.cell, sigma * grid.cell, places)
 
 
 def _nearest(before: Reals, now: Reals) -> int:

@@ -105,20 +105,20 @@ def reference_findings(evidence: Evidence, limits: ReferenceLimits | None = None
     for name, kind, rule in RULES:
         if not (frames := evidence.frames(kind)):
             continue
-        odd = list(rule(evidence, limits or ReferenceLimits()))
-        rows = {frame.row for each in odd for frame in each.frames}
+        bad_groups = list(rule(evidence, limits or ReferenceLimits()))
+        rows = {frame.row for each in bad_groups for frame in each.frames}
         none_left = bool(rows) and rows == {frame.row for frame in frames}
-        judged += _in_words(name, kind, odd, "error" if none_left else "warning")
+        judged += _in_words(name, kind, bad_groups, "error" if none_left else "warning")
         if none_left:
             break
         evidence = evidence.without(rows)
     return tuple(judged)
 
 
-def _in_words(name: str, kind: FrameKind, odd: list[BadFrames], severity: Severity) -> Iterator[Finding]:
+def _in_words(name: str, kind: FrameKind, bad_frames: list[BadFrames], severity: Severity) -> Iterator[Finding]:
     """One finding for each sentence, with all the frames that it names."""
-    for sentence in dict.fromkeys(each.sentence for each in odd):
-        alike = [each for each in odd if each.sentence == sentence]
+    for sentence in dict.fromkeys(each.sentence for each in bad_frames):
+        alike = [each for each in bad_frames if each.sentence == sentence]
         own = tuple(sorted(frame.row for each in alike for frame in each.frames))
         text = f"The {kind.name.lower()}s {spans(own)}: {sentence}" if own else sentence
         yield Finding(severity, name, text, own, alike[0].score, alike[0].limit)
@@ -131,12 +131,12 @@ def _with_holes(kind: FrameKind) -> Rule:
     def with_holes(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames]:
         for group in evidence.of_kind(kind):
             limit = min(min(frame.invalid for frame in group) + INVALID, 0.5)
-            if odd := [frame for frame in group if frame.invalid > limit or frame.blank]:
-                text = range_in_words([frame.invalid for frame in odd])
+            if bad_frames := [frame for frame in group if frame.invalid > limit or frame.blank]:
+                text = range_in_words([frame.invalid for frame in bad_frames])
                 sentence = f"a fraction of {text} of the pixels has no valid value (limit {limit:.3g})."
-                if all(frame.blank for frame in odd):
+                if all(frame.blank for frame in bad_frames):
                     sentence = f"no pixel has a valid value: all are NaN, infinite or above {LARGEST:g}."
-                yield BadFrames(odd, max(frame.invalid for frame in odd), limit, sentence)
+                yield BadFrames(bad_frames, max(frame.invalid for frame in bad_frames), limit, sentence)
 
     return with_holes
 
@@ -160,9 +160,9 @@ def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames
         intensity = (max(flats) if flats else float(levels.max())) - lowest
         limit = max(LIT * intensity, LIT_SIGMAS * place_noise(base.blocks))
         if (above := levels[levels - lowest > limit] - lowest).size:
-            odd = [same[place] for place in np.flatnonzero(levels - lowest > limit).tolist()]
+            bad_frames = [same[index] for index in np.flatnonzero(levels - lowest > limit).tolist()]
             least_dark = f"the darkest dark, frame {base.row} with {lowest:.6g}"
-            yield BadFrames(odd, float(above.max()), limit, (
+            yield BadFrames(bad_frames, float(above.max()), limit, (
                 f"these darks were exposed to the beam, or the offset changed: the darks are {range_in_words(above)} "
                 f"counts "
                 f"above {least_dark} (limit {limit:.3g}, because the flats have {intensity:.6g} counts of beam)."
@@ -179,16 +179,18 @@ def _saturated(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrame
     hot = float(np.median([dark.saturated for dark in darks])) if darks else 0.0
     for group in evidence.of_kind(FLAT):
         shares, limit = np.array([flat.saturated - hot for flat in group]), saturation_limit(group[0].pixels, limits)
-        over, most = shares > limit, float(shares.max())
-        if all(frame.constant for frame in (*group, *darks)) and not (over.any() and level(darks or group)):
+        is_over, largest_share = shares > limit, float(shares.max())
+        if all(frame.constant for frame in (*group, *darks)) and not (is_over.any() and level(darks or group)):
             continue
-        if over.any():
-            what = f"{most:.2%} of the pixels are saturated (limit {limit:.2%}), so the intensity is not known"
-            odd = [group[place] for place in np.flatnonzero(over).tolist()]
-            yield BadFrames(odd, most, limit, f"{what}. Shorten the exposure or add a filter.")
+        if is_over.any():
+            finding = (
+                f"{largest_share:.2%} of the pixels are saturated (limit {limit:.2%}), so the intensity is not known"
+            )
+            bad_frames = [group[index] for index in np.flatnonzero(is_over).tolist()]
+            yield BadFrames(bad_frames, largest_share, limit, f"{finding}. Shorten the exposure or add a filter.")
         elif all(flat.constant for flat in group):
-            what = f"all pixels are saturated: every pixel is {level(group):g}, although the darks have noise"
-            yield BadFrames(group, 1.0, limit, f"{what}. Shorten the exposure or add a filter.")
+            finding = f"all pixels are saturated: every pixel is {level(group):g}, although the darks have noise"
+            yield BadFrames(group, 1.0, limit, f"{finding}. Shorten the exposure or add a filter.")
 
 
 def saturation_limit(pixels: int, limits: ReferenceLimits) -> float:
@@ -215,14 +217,16 @@ def _beam_lost(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrame
     """Rule: flats with much less intensity than the brightest group."""
     bright, limit = evidence.brightest, limits.light_gone
     for group in evidence.of_kind(FLAT):
-        gone = np.array([1 - evidence.intensity_of([flat]) / evidence.intensity_of(bright) for flat in group])
-        if (gone > limit).any():
-            others, most = spans([flat.row for flat in bright]), float(gone.max())
+        lost_share = np.array([1 - evidence.intensity_of([flat]) / evidence.intensity_of(bright) for flat in group])
+        if (lost_share > limit).any():
+            others, largest_loss = spans([flat.row for flat in bright]), float(lost_share.max())
             sentence = (
-                f"the beam was lost: these flats have {most:.0%} less intensity than the flats {others} (limit "
+                f"the beam was lost: these flats have {largest_loss:.0%} less intensity than the flats {others} (limit "
                 f"{limit:.0%})."
             )
-            yield BadFrames([group[place] for place in np.flatnonzero(gone > limit).tolist()], most, limit, sentence)
+            yield BadFrames(
+                [group[place] for place in np.flatnonzero(lost_share > limit).tolist()], largest_loss, limit, sentence
+            )
 
 
 def _dimmer_than_views(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
@@ -256,18 +260,20 @@ def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
         changed, noise = float(np.ptp(levels)), float(np.median(local)) / MEDIAN
         far = np.abs(levels - np.median(levels)) > limit / 2 if changed > limit else np.zeros(levels.size, np.bool_)
         moved = (places > max(limit, CHANGE_SIGMAS * noise)) & ~far
-        odd = [flat for flat, is_odd in zip(group, far | moved, strict=True) if is_odd]
-        whole = 2 * len(odd) >= len(group)
-        how = "from flat to flat" if whole else "from the usual flat of their group"
+        bad_frames = [flat for flat, is_odd in zip(group, far | moved, strict=True) if is_odd]
+        whole = 2 * len(bad_frames) >= len(group)
+        compared_with = "from flat to flat" if whole else "from the usual flat of their group"
         if far.any():
             n = lights_in_turn(levels)
-            why = f"{n} thresholds, exposures or energies were used in turn" if n else "the beam is unstable"
-            sentence = f"the intensity of these flats differs by {changed:.0%} {how} (limit {limit:.0%}): {why}."
-            yield BadFrames(group if whole else odd, changed, limit, sentence)
-        elif odd:
-            yield BadFrames(group if whole else odd, float(places.max()), limit, (
+            reason = f"{n} thresholds, exposures or energies were used in turn" if n else "the beam is unstable"
+            sentence = (
+                f"the intensity of these flats differs by {changed:.0%} {compared_with} (limit {limit:.0%}): {reason}."
+            )
+            yield BadFrames(group if whole else bad_frames, changed, limit, sentence)
+        elif bad_frames:
+            yield BadFrames(group if whole else bad_frames, float(places.max()), limit, (
                 "something was in the beam. Was the sample out of the beam? The intensity differs locally by "
-                f"{places.max():.0%} {how} (limit {limit:.0%})."
+                f"{places.max():.0%} {compared_with} (limit {limit:.0%})."
             ))  # fmt: skip
 
 

@@ -60,27 +60,28 @@ def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[BadFrames]
     else:
         means = [np.mean(own, axis=0) for own in intensity]
         compared = [(list(group), means[i], means[:i] + means[i + 1 :]) for i, group in enumerate(groups)]
-    compared_with, odd = "other flats of their group" if single else "other flats", list[BadFrames]()
+    compared_with, bad_frames = "other flats of their group" if single else "other flats", list[BadFrames]()
     for frames, image, others in compared:
         if others and (nearest_view := _nearest_view(image, others, projections)) is not None:
-            off, like, nearest = nearest_view
+            difference, like, nearest = nearest_view
             nearest_frame = views[nearest].row
-            odd.append(BadFrames(frames, off, like / LIKER, (
-                f"the sample was in the beam. In line integral, these flats differ by {off:.3g} from the "
+            bad_frames.append(BadFrames(frames, difference, like / LIKER, (
+                f"the sample was in the beam. In line integral, these flats differ by {difference:.3g} from the "
                 f"{compared_with}, but only by {like:.2g} from the projection in frame {nearest_frame}."
             )))  # fmt: skip
-    if len(odd) < len(compared):  # otherwise the beam drifts, and each flat is similar to the projections next to it
-        yield from odd
+    # otherwise the beam drifts, and each flat is similar to the projections next to it
+    if len(bad_frames) < len(compared):
+        yield from bad_frames
 
 
 def _nearest_view(image: F32, others: Sequence[F32], views: Sequence[F32]) -> tuple[float, float, int] | None:
     """The difference of a flat from the most similar other flat and from the most similar projection, and the number of
     this projection. None if the flat does not show the sample."""
     exposed = lit_places(np.maximum.reduce([image, *others]))
-    off = _beyond_noise(min((log_ratio(image, flat, exposed) for flat in others), key=_spread))
-    like = [_beyond_noise(log_ratio(image, view, exposed)) for view in views] if off > 0 else [np.inf]
+    difference = _beyond_noise(min((log_ratio(image, flat, exposed) for flat in others), key=_spread))
+    like = [_beyond_noise(log_ratio(image, view, exposed)) for view in views] if difference > 0 else [np.inf]
     nearest = int(np.argmin(like))
-    return (off, like[nearest], nearest) if like[nearest] < LIKER * off else None
+    return (difference, like[nearest], nearest) if like[nearest] < LIKER * difference else None
 
 
 class ViewsAboveFlats(NamedTuple):
@@ -147,9 +148,9 @@ def flats_below_views(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
 def views_brighter(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     """Rule: projections are brighter than flats at some places, and less so at the edges."""
     if (above := _views_above_flats(evidence)) is not None:
-        most = int(np.argmax(above.brightest))
-        top = float(above.brightest[most])
-        if min(top, top - float(above.at_edges[most])) > above.limit:
+        brightest_view = int(np.argmax(above.brightest))
+        top = float(above.brightest[brightest_view])
+        if min(top, top - float(above.at_edges[brightest_view])) > above.limit:
             yield BadFrames((), top, above.limit, (
                 "Was the sample, or something else, in the beam during the flats, or did the beam change its shape? "
                 f"The projections are locally brighter than the flats by {top:.2g} in line integral, but a sample can "
@@ -198,11 +199,11 @@ def views_show_nothing(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
         return
     mean = depth.mean(axis=0)
     limits = [SIGMAS * place_noise(part) for part in (mean, depth - mean)]
-    shown = [float(np.abs(part).max()) for part in (mean - np.median(mean), depth - mean)]
-    if all(most < limit for most, limit in zip(shown, limits, strict=True)):
-        yield BadFrames((), max(shown), max(limits), (
+    largest = [float(np.abs(part).max()) for part in (mean - np.median(mean), depth - mean)]
+    if all(value < limit for value, limit in zip(largest, limits, strict=True)):
+        yield BadFrames((), max(largest), max(limits), (
             "The projections show no sample: the projections that were checked differ from the flats only by noise "
-            f"(all line integrals are below {max(shown):.2g}). Check whether the sample was in the field of view. If "
+            f"(all line integrals are below {max(largest):.2g}). Check whether the sample was in the field of view. If "
             "it was, it was also in the beam during the flats and looks the same from all sides: take new flats "
             "without the sample."
         ))  # fmt: skip
@@ -221,8 +222,10 @@ def _depth_over_air(evidence: Evidence) -> F64 | None:
     if len(views) < FEWEST or not rows.size or cols.size < EDGE:
         return None
     part = np.ix_(rows, cols)
-    every = np.ones(intensity[part].shape, np.bool_)
-    lines = (log_ratio(evidence.intensity(view)[part], intensity[part], every).reshape(every.shape) for view in views)
+    all_cells = np.ones(intensity[part].shape, np.bool_)
+    lines = (
+        log_ratio(evidence.intensity(view)[part], intensity[part], all_cells).reshape(all_cells.shape) for view in views
+    )
     depth = -np.stack(list(lines))
     n = max(1, cols.size // EDGE)
     left_edge, right_edge = depth[:, :, :n].mean(axis=2), depth[:, :, -n:].mean(axis=2)

@@ -221,9 +221,9 @@ def spots_of(
     """The spots of a projection or a flat, found with the previous frame and the preview of the darks."""
     if before is None or frame.kind is FrameKind.DARK or digest.preview.shape != before.preview.shape:
         return NO_SPOTS
-    every = max(1, digest.preview.size // SAMPLES)
-    base = 0.0 if dark is None else float(np.median(dark.ravel()[::every]))
-    mean, peak = digest.preview.ravel()[::every], digest.peaks.ravel()[::every]
+    stride = max(1, digest.preview.size // SAMPLES)
+    base = 0.0 if dark is None else float(np.median(dark.ravel()[::stride]))
+    mean, peak = digest.preview.ravel()[::stride], digest.peaks.ravel()[::stride]
     usual = float(np.median((peak - mean) / np.sqrt(np.maximum(mean - base, 1))))
     if not usual > 0:  # blocks of one pixel, or frames without noise
         return NO_SPOTS
@@ -246,10 +246,10 @@ def _isolated(digest: FrameDigest, before: NDArray[np.float32], dark: float, noi
         (_around(image, rows, cols) for image in (digest.preview, before)),
         digest.peaks[rows, cols],
     )
-    around = np.delete(neighbours, 4, axis=1).max(axis=1)  # the block itself is left out
-    intensity = np.maximum(around - dark, 1)
-    bright = peaks - around > np.maximum(noises * np.sqrt(intensity), RELATIVE * intensity)
-    new = was.max(axis=1) - around < 0.5 * (peaks - around)
+    brightest_neighbour = np.delete(neighbours, 4, axis=1).max(axis=1)  # the block itself is left out
+    intensity = np.maximum(brightest_neighbour - dark, 1)
+    bright = peaks - brightest_neighbour > np.maximum(noises * np.sqrt(intensity), RELATIVE * intensity)
+    new = was.max(axis=1) - brightest_neighbour < 0.5 * (peaks - brightest_neighbour)
     return np.stack([rows, cols], axis=1)[bright & new]
 
 

@@ -247,15 +247,15 @@ def _with_good_view(monitor: Monitor, view: CellView, recent: tuple[CellView, ..
     )
 
 
-def _of_one_view(apart: float, step: float) -> bool:
+def _of_one_view(distance: float, step: float) -> bool:
     """Largest difference in radians between two frames that belong to one projection."""
-    return abs(math.remainder(apart, 2 * math.pi)) < (SAME_ANGLE if math.isnan(step) else SAME * abs(step))
+    return abs(math.remainder(distance, 2 * math.pi)) < (SAME_ANGLE if math.isnan(step) else SAME * abs(step))
 
 
 def _nearest(angle: float, spread_views: Sequence[CellView]) -> CellView | None:
     """The projection nearest in angle, if it is within EVERY; otherwise None."""
-    apart = [abs(math.remainder(angle - view.angle, 2 * math.pi)) for view in spread_views]
-    return spread_views[int(np.argmin(apart))] if apart and min(apart) < EVERY else None
+    distances = [abs(math.remainder(angle - view.angle, 2 * math.pi)) for view in spread_views]
+    return spread_views[int(np.argmin(distances))] if distances and min(distances) < EVERY else None
 
 
 def _with_reference(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:

@@ -156,12 +156,14 @@ class StampedValues:
             event = event_in(line) or {}
             # a field is missing, or has another type
             with suppress(LookupError, TypeError, ValueError, ArithmeticError):
-                at, taken, severity = float(event["time"]), event_values(values, event), _severity(event)
-                texts = {name: one_line(value, LONGEST) for name, value in taken.items() if isinstance(value, str)}
-                values = replace(values, **{**taken, **texts})
-                for name in taken:
+                time, values_of_event, severity = float(event["time"]), event_values(values, event), _severity(event)
+                texts = {
+                    name: one_line(value, LONGEST) for name, value in values_of_event.items() if isinstance(value, str)
+                }
+                values = replace(values, **{**values_of_event, **texts})
+                for name in values_of_event:
                     worst = severity if name in _ALARMED else Severity.NO_ALARM
-                    stamps[name] = Stamp(at, worst, values.message if worst else "")
+                    stamps[name] = Stamp(time, worst, values.message if worst else "")
         return replace(self, values=values, stamps=stamps)
 
     def with_file(self, seen: Mapping[str, Any], angle: float, now: float) -> StampedValues:
@@ -181,9 +183,9 @@ class StampedValues:
         # because no log may state it
         ended = status == DIED or seen.get("over") or (not before.run and status != "running")
         if ended and status != before.state:
-            why = one_line(seen["next"], LONGEST)
-            taken |= {"state": status, "message": why, "wait": 0.0}
-            stamps["state"] = stamps["message"] = Stamp(now, _OF_STATE.get(status, Severity.NO_ALARM), why)
+            reason = one_line(seen["next"], LONGEST)
+            taken |= {"state": status, "message": reason, "wait": 0.0}
+            stamps["state"] = stamps["message"] = Stamp(now, _OF_STATE.get(status, Severity.NO_ALARM), reason)
         return replace(self, values=replace(before, **taken), stamps=stamps, unread="")
 
 
@@ -245,21 +247,21 @@ class FollowedRun:
             return self.stamped
 
     def _read(self) -> StampedValues:
-        what, stamped = watched(newest(self.runs)), self.stamped
-        if self._reader is None or self._reader.what != what:
+        watched_run, stamped = watched(newest(self.runs)), self.stamped
+        if self._reader is None or self._reader.what != watched_run:
             if self._reader is not None:
                 self._reader.close()
-            self._reader, self._lines = Reader(what), 0
+            self._reader, self._lines = Reader(watched_run), 0
             stamped = StampedValues(RunValues(), self._now())
-        seen, angle, why = None, math.nan, ""
+        seen, angle, reason = None, math.nan, ""
         try:
             seen = self._reader.state()
             angle = self._reader.do(_newest_angle) if seen["frames"] else math.nan
         except (DataError, NotReadyError, OSError) as error:
-            why = user_message(error)
+            reason = user_message(error)
         lines = self._reader.events.lines
         stamped, self._lines = stamped.after(lines[self._lines :]), len(lines)
-        return replace(stamped, unread=why) if seen is None else stamped.with_file(seen, angle, self._now())
+        return replace(stamped, unread=reason) if seen is None else stamped.with_file(seen, angle, self._now())
 
 
 def _newest_angle(recording: Recording) -> float:

@@ -91,12 +91,12 @@ class EventLog:
         with suppress(OSError), open_below(self._folder, EVENTS) as file:
             file.seek(self._at)
             added = file.read(_AT_ONCE)
-            *whole, begun = added.split(b"\n")
-            if not whole and len(added) == _AT_ONCE:  # a line without end
+            *complete_lines, incomplete_line = added.split(b"\n")
+            if not complete_lines and len(added) == _AT_ONCE:  # a line without end
                 self._at, self._within = self._at + len(added), True
                 return
-            self._at += len(added) - len(begun)
-            for line in whole:
+            self._at += len(added) - len(incomplete_line)
+            for line in complete_lines:
                 self._add(b"" if self._within else line)
                 self._within = False
 

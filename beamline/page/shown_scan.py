@@ -153,16 +153,16 @@ class ShownScan:
         from recon.voxels.direct import direct
 
         self._read(row, tilt_deg)
-        every = max(1, -(-len(self._ids) // _FAST_VIEWS)) if fast else 1
-        data, angles = self._lines[::every], self._source.table.angles[self._ids[::every]]
+        view_stride = max(1, -(-len(self._ids) // _FAST_VIEWS)) if fast else 1
+        data, angles = self._lines[::view_stride], self._source.table.angles[self._ids[::view_stride]]
         geometry = self._scan.part(rows=(self._band.start, self._band.stop)).selection.geometry(axis_col, angles)
         whole = Grid.matching(geometry)
         cols, voxel, height = self._source.shape[1], whole.voxel_size, 0.0
         centred = abs(axis_col - (cols - 1) / 2) < _CENTRED * cols
         n = cols if centred else whole.shape[1]  # otherwise the slice would jump with each column
-        shown, most = region.inside((n, n)), _FAST_MOST if fast else _MOST
+        shown, most_voxels = region.inside((n, n)), _FAST_MOST if fast else _MOST
         ends = (shown.first_row, shown.last_row), (shown.first_col, shown.last_col)
-        step = -(-max(last - begin for begin, last in ends) // most)
+        step = -(-max(last - begin for begin, last in ends) // most_voxels)
         if geometry.is_cone:
             height = (row - (self._source.shape[0] - 1) / 2) * voxel
         else:
@@ -198,11 +198,11 @@ class ShownScan:
         rows, cols = self._source.shape
         if not 0 <= row < rows:
             raise DataError(f"Row {row} is outside the detector, which has {rows} rows.")
-        beside = _BESIDE + math.ceil(cols / 2 * math.sin(math.radians(abs(tilt_deg))))
-        if row == self._row and beside <= self._beside:
+        neighbour_rows = _BESIDE + math.ceil(cols / 2 * math.sin(math.radians(abs(tilt_deg))))
+        if row == self._row and neighbour_rows <= self._beside:
             return
-        beside = 1 << (beside - 1).bit_length()  # so that the rows are ready if the slider moves on
-        near, far = row - beside, row + beside
+        neighbour_rows = 1 << (neighbour_rows - 1).bit_length()  # so that the rows are ready if the slider moves on
+        near, far = row - neighbour_rows, row + neighbour_rows
         if (cone := self._cone) is not None:
             middle, half = (rows - 1) / 2, cols / 2 * (self._source.pixel_size_mm or 0.0) / cone[1]
             edges = [middle + (row - middle) / (1 + side * half) for side in (-1, 1)]
@@ -210,15 +210,15 @@ class ShownScan:
         frames = self._views.frames[np.isfinite(self._degrees)]
         if not frames.size:
             raise DataError(f"Give --angles FILE: a slice needs angles, and {self._source.path} states none.")
-        some = spread_views(self._source.table.angles[frames], _VIEWS, frames)
+        chosen = spread_views(self._source.table.angles[frames], _VIEWS, frames)
         band = range(max(near, 0), min(far + 1, rows))
         try:
-            self._plan = self._plan or survey(self._scan, some)
-            corrected = apply(self._plan, some, slice(band.start, band.stop))
+            self._plan = self._plan or survey(self._scan, chosen)
+            corrected = apply(self._plan, chosen, slice(band.start, band.stop))
         except ValueError as error:
             raise DataError(f"The projections cannot be corrected: {error}.") from error
         self._lines, self._ids = corrected.data, corrected.view_ids
-        self._row, self._beside, self._band = row, beside, band
+        self._row, self._beside, self._band = row, neighbour_rows, band
 
     def _line(self, data: F32, row: int, tilt_deg: float) -> F32:
         """The row [view, col] of the projections after rotation by the tilt, with linear interpolation between

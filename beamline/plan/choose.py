@@ -54,17 +54,17 @@ def frame_dose(timeline: Timeline) -> float:
 
 
 def options(
-    passes: Passes, law: ErrorLaw | None, timeline: Timeline, seconds_of: Callable[[Block], float]
+    passes: Passes, error_law: ErrorLaw | None, timeline: Timeline, seconds_of: Callable[[Block], float]
 ) -> tuple[PassOption, ...]:
     """The choices that are possible now. ENOUGH is always possible and comes last.
 
     Args:
-        law: the error model with `passes.n_frames` as its `n_views`; None: not known.
+        error_law: the error model with `passes.n_frames` as its `n_views`; None: not known.
         seconds_of: function that returns the duration of a block, from the present position of the stage.
     """
 
     def option(choice: Choice, frames: int, seconds: float, **added: Any) -> PassOption:
-        gain = Gain(math.nan, math.nan, math.nan) if law is None else law.gain(**added)
+        gain = Gain(math.nan, math.nan, math.nan) if error_law is None else error_law.gain(**added)
         cost = frames, seconds, frames * frame_dose(timeline), frames * timeline.total_bytes // timeline.n_frames
         return PassOption(choice, *cost, gain.mean, gain.low, gain.high)
 
@@ -114,21 +114,21 @@ def choose(
     )
 
 
-def remaining_gain(passes: Passes, law: ErrorLaw) -> Gain:
+def remaining_gain(passes: Passes, error_law: ErrorLaw) -> Gain:
     """The predicted improvement by the rest of the plan."""
     views = sum(block.n_to_take for block in passes.to_come) + passes.retakes
-    return replace(law, n_views=passes.n_frames).gain(views=views, wide=bool(passes.offset))
+    return replace(error_law, n_views=passes.n_frames).gain(views=views, wide=bool(passes.offset))
 
 
 def next_is_sure(
-    passes: Passes, offered: Sequence[PassOption], target: ScanTarget, law: ErrorLaw, seconds: float, dose: float
+    passes: Passes, offered: Sequence[PassOption], target: ScanTarget, error_law: ErrorLaw, seconds: float, dose: float
 ) -> bool:
     """True if the error model of an earlier pass is enough for the decision. It must choose the next pass; and after
     this pass, the rest of the plan must still be certain to improve the volume by more than the loss that the target
     accepts.
     """
-    choice, _ = choose(offered, target, remaining_gain(passes, law), seconds, dose)
-    later = remaining_gain(passes.after(Choice.NEXT), law)
+    choice, _ = choose(offered, target, remaining_gain(passes, error_law), seconds, dose)
+    later = remaining_gain(passes.after(Choice.NEXT), error_law)
     return choice is Choice.NEXT and (target.quality_db is None or later.low > target.quality_db)
 
 

@@ -98,9 +98,9 @@ def _lattice(angles: NDArray[np.float64], count: float) -> tuple[NDArray[np.int6
     step = (high - low) / (angles.size - 1)
     if step > 0:
         index = np.rint((angles - low) / step).astype(np.int64)
-        off = float(np.abs(low + index * step - angles).max())
+        deviation = float(np.abs(low + index * step - angles).max())
         # Half a count is lost to rounding anyway; a text file with few digits loses less than a hundredth of a step.
-        if np.unique(index).size == angles.size and off <= max(count / 2, step / 100):
+        if np.unique(index).size == angles.size and deviation <= max(count / 2, step / 100):
             return index, step
     raise ValueError(
         "a rotating stage cannot trigger at these angles, because they are not equally spaced. Use scan.mode: step, or "

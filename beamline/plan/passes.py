@@ -80,14 +80,14 @@ def ended_by(decisions: Iterable[Mapping[str, Any]]) -> str:
         decisions: values of the events `next_chosen`, oldest first.
     """
     last = next((each for each in decisions if each.get("choice") == Choice.ENOUGH), {})
-    after, by, why, dropped = (last.get(name) for name in ("passes", "by", "reason", "dropped"))
+    after, by, reason, dropped = (last.get(name) for name in ("passes", "by", "reason", "dropped"))
     chosen = f" by the {by}" if by else ""
     chosen += (
-        f": {why}".rstrip(".") if why and by != "operator" else ""
+        f": {reason}".rstrip(".") if reason and by != "operator" else ""
     )  # if the operator decided, the reason only repeats this
-    rest = f" {dropped} planned frames were not taken." if dropped else ""
+    dropped_text = f" {dropped} planned frames were not taken." if dropped else ""
     return (
-        f"The scan ended after pass {after or last.get('number')}, because `enough` was chosen{chosen}.{rest}"
+        f"The scan ended after pass {after or last.get('number')}, because `enough` was chosen{chosen}.{dropped_text}"
         if last
         else ""
     )

@@ -267,10 +267,10 @@ def interlaced(views: int, passes: int, start: float = 0.0, span: float = math.p
     _require(views)
     if passes < 1 or views % passes or (passes > 1 and views // passes < 2):
         legal = [p for p in range(1, views // 2 + 1) if views % p == 0] or [1]
-        some = ", ".join(map(str, legal[:12])) + (" ..." if len(legal) > 12 else "")
+        listed = ", ".join(map(str, legal[:12])) + (" ..." if len(legal) > 12 else "")
         raise ValueError(
             f"{views} projections cannot be divided into {passes} equal passes of two or more projections; "
-            f"possible numbers of passes: {some}"
+            f"possible numbers of passes: {listed}"
         )
     index = (pass_order(passes)[:, None] + np.arange(0, views, passes)[None, :]).ravel()
     return fixed(views, start, span)[index]

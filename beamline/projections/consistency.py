@@ -253,7 +253,7 @@ def _opposite_views(
     difference_found = float(max(unexplained_change[first, last], 0)) if opposite.any() else np.nan
     earlier, later = sorted(frames[[first, last]])
     difference = abs(levels[first] - levels[last])
-    what = (
+    difference_text = (
         f"Frames {earlier} and {later}, 180° apart, must be mirror images, but they differ by {difference:.2f} in "
         "line integral"
     )
@@ -261,15 +261,15 @@ def _opposite_views(
     if outlier_size > max(_INTENSITY_STEP, np.nan_to_num(difference_found)):
         difference_found = outlier_size
         odd_frame = frames[outlier]
-        what = (
+        difference_text = (
             f"Frame {odd_frame} as a whole is brighter or darker than the frames at neighbouring angles: the median "
             f"of its line integrals jumps by {outlier_size:.2f} more than is usual between neighbouring frames of this "
             "scan"
         )
     sentence = (
-        f"{what}. The intensity, the exposure time, the energy or the filter changed, or some projections belong to "
-        "another scan. The program cannot correct this, because no detector column shows air next to the sample. Use "
-        "--views to choose projections that belong together, or --air to state which columns are air."
+        f"{difference_text}. The intensity, the exposure time, the energy or the filter changed, or some projections "
+        "belong to another scan. The program cannot correct this, because no detector column shows air next to the "
+        "sample. Use --views to choose projections that belong together, or --air to state which columns are air."
     )
     return ConsistencyCondition(
         "light of opposite views", difference_found, _INTENSITY_STEP, "in line integral", sentence
@@ -357,7 +357,9 @@ def _fan_angle(data: F32, view_numbers: NDArray[np.intp], geometry: Geometry) ->
         sinogram, geometry.angles[view_numbers], geometry.axis_col, stated_slope
     )
     stated_angle, best_angle = (2 * math.degrees(math.atan(slope * half_width)) for slope in (stated_slope, best_slope))
-    away = f" ({pitch / best_slope:.3g} mm from source to detector)" if geometry.is_cone and best_slope > 0 else ""
+    distance_text = (
+        f" ({pitch / best_slope:.3g} mm from source to detector)" if geometry.is_cone and best_slope > 0 else ""
+    )
     check = (
         "Check --cone SOD:SDD: both are in mm, and SDD is the distance from the source to the detector, "
         "not from the axis."
@@ -367,7 +369,7 @@ def _fan_angle(data: F32, view_numbers: NDArray[np.intp], geometry: Geometry) ->
     )
     sentence = (
         f"{check} The projections contradict the stated geometry. A 360° scan measures each ray twice, from opposite "
-        f"sides. The two values agree best if the fan angle is {best_angle:.3g} degrees{away}, but the stated "
+        f"sides. The two values agree best if the fan angle is {best_angle:.3g} degrees{distance_text}, but the stated "
         f"distances give a fan angle of {stated_angle:.3g} degrees."
     )
     slope_from_axis = pitch / (geometry.sdd + geometry.sod) if geometry.is_cone else np.inf  # SDD stated from the axis
@@ -448,11 +450,11 @@ def _ends_of_turn(data: F32, geometry: Geometry, stretch: float) -> str:
     same_rays = change < step_change / 2
     if same_rays == closed or not abs(stretch * order.size + (1 if closed else -1)) < _OF_A_STEP:
         return ""
-    what = "directions one step apart" if closed else "the same rays"
+    compared_text = "directions one step apart" if closed else "the same rays"
     include_or_not = "include" if closed else "do not include"
     large_or_small = "too large" if closed else "too small"
     return (
-        f"The first and the last projection show {what}, but the stated angles {include_or_not} both ends of "
+        f"The first and the last projection show {compared_text}, but the stated angles {include_or_not} both ends of "
         f"{math.degrees(turn):.4g} degrees. The angular step is {large_or_small}, by one part in {order.size}."
     )
 

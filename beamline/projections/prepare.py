@@ -257,10 +257,10 @@ def assemble(
             f"{source.path}: there is no sample in the beam: the line integrals of the chosen projections are "
             "zero everywhere."
         )
-    unknown, resampling = projections.masked, selection.step(TiltAndLens).of(scan)
+    unmeasured, resampling = projections.masked, selection.step(TiltAndLens).of(scan)
     if resampling is not None:
-        unknown = unknown | resampling.outside_detector((height, width), rows.start)
-    unknown = areas(unknown)
+        unmeasured = unmeasured | resampling.outside_detector((height, width), rows.start)
+    unmeasured = areas(unmeasured)
     regions = replace(usable.regions, resampling=resampling).and_unmeasured(projections.unmeasured, first, binning)
 
     def region_weights_of(views: slice, part: slice) -> NDArray[np.float32] | None:
@@ -281,7 +281,7 @@ def assemble(
         ),
         sources=WeightSources(
             usable.weights_of(ids),
-            ~unknown if unknown.any() else None,
+            ~unmeasured if unmeasured.any() else None,
             None if on_disk else region_weights_of(slice(None), slice(0, height)),
             region_weights_of if on_disk and regions.mark(ids) else None,
         ),

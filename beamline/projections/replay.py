@@ -67,7 +67,7 @@ class SkippedChecks:
             ("opposite", self.in_cone, "cone beam"),
             ("mass", self.wider_than_field, "sample wider than the field of view"),
         )
-        return tuple(f"{checks} in {n} of {self.views} projections ({why})" for checks, n, why in reasons if n)
+        return tuple(f"{checks} in {n} of {self.views} projections ({reason})" for checks, n, reason in reasons if n)
 
 
 @dataclass(frozen=True, eq=False)

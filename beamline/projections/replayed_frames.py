@@ -45,11 +45,11 @@ def frames_of(
     """
     done = 0
     for n in growing(source, follow) if follow is not None else (source.refresh(),):
-        again = frozenset(source.table.replaced.tolist())
+        retaken = frozenset(source.table.replaced.tolist())
         for frame in _frames(source, done):
             if should_stop():
                 return
-            if frame.index in again:  # as the monitor saw the frame, before the frame was taken again
+            if frame.index in retaken:  # as the monitor saw the frame, before the frame was taken again
                 frame = replace(frame, kind=FrameKind.PROJECTION)
             yield frame, n
         done = n
@@ -84,8 +84,8 @@ def growing(source: ScanSource, clock: Clock, patience: float = PATIENCE, poll: 
         ended = source.finished  # read before the number of frames, so that no frame can arrive in between
         before, n = n, source.refresh()
         yield n
-        if not ended and (why := writer.lost(clock.now(), n > before, lambda: source.finished)):
-            raise DataError(f"{source.path} {why} and is not finished; it has {n} frames. {next_step(source.path)}")
+        if not ended and (reason := writer.lost(clock.now(), n > before, lambda: source.finished)):
+            raise DataError(f"{source.path} {reason} and is not finished; it has {n} frames. {next_step(source.path)}")
         if not ended:
             clock.sleep(poll)
 

@@ -87,7 +87,7 @@ def _of_kind(
         if finite_values.size:
             low, high = min(low, float(finite_values.min())), max(high, float(finite_values.max()))
     if not n_finite:
-        unknown = (np.nan,) * len(PERCENT)
+        no_values = (np.nan,) * len(PERCENT)
         return KindStatistics(
             kind,
             rows.size,
@@ -96,7 +96,7 @@ def _of_kind(
             np.nan,
             np.nan,
             np.nan,
-            unknown,
+            no_values,
             0.0,
             1.0,
             np.zeros(2),

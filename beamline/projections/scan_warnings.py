@@ -124,7 +124,7 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
     Args:
         first_row: row of the detector at which the (binned) rows begin.
     """
-    what = "slice" if prepared.geometry.rows_show_slices else "row"
+    layer = "slice" if prepared.geometry.rows_show_slices else "row"
     corrected, (lost_rows, interpolated_rows) = prepared.corrected, prepared.unmeasured_rows
     masked, runs = corrected.masked.copy(), corrected.unmeasured
     masked[lost_rows] = False
@@ -176,9 +176,9 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
         (interpolated_rows, "interpolated from their neighbours"),
     ):
         if dead_rows.size:
-            result = result_of_slices if what == "slice" else "not used. Voxels that no other row shows are 0"
+            result = result_of_slices if layer == "slice" else "not used. Voxels that no other row shows are 0"
             warn(
-                f"No data in {count(dead_rows.size, what)} of {len(masked)} (counted from 0: "
+                f"No data in {count(dead_rows.size, layer)} of {len(masked)} (counted from 0: "
                 f"{spans(dead_rows.tolist())}), because in all projections these detector rows have no beam, zeros, "
-                f"no finite values, or dead pixels. These {what}s are {result}."
+                f"no finite values, or dead pixels. These {layer}s are {result}."
             )

@@ -32,24 +32,24 @@ def in_budget(
     """
     end = now() + budget
     timing = Timing(geometry, grid, now, _TIMED_VOXELS)
-    affordable, seconds, refused = list[Method](), dict[str, float](), list[str]()
+    affordable, seconds, too_slow = list[Method](), dict[str, float](), list[str]()
     for each in method.alternatives:
         try:
             seconds[each.name] = timing.of(each).most
             affordable.append(each)
         except ValueError as error:
-            refused.append(f"{each.name}: {error}")
+            too_slow.append(f"{each.name}: {error}")
     if not affordable:
-        raise ValueError("; ".join(refused))
+        raise ValueError("; ".join(too_slow))
     chosen, expected = _without_slow(method, affordable), 0.0
     while (expected := timing.of(chosen).most) > end - now() and len(affordable) > 1:
         affordable.remove(max(affordable, key=lambda each: seconds[each.name]))
         chosen = _without_slow(method, affordable)
-    if (late := expected - (end - now())) > 0:
+    if (excess_seconds := expected - (end - now())) > 0:
         fastest_name = affordable[0].name
         warn(
             f"{duration_text(budget)} is too short for this scan: even the fastest method, {fastest_name}, which is "
-            f"used now, will end about {duration_text(late)} after this limit."
+            f"used now, will end about {duration_text(excess_seconds)} after this limit."
         )
     names = [each.name for each in affordable]
     out = [

@@ -54,12 +54,12 @@ class Estimate(Need):
         if self.done:
             n_slices = self.shape[0]
             in_slabs = f"in {count(self.slabs, 'slab')} remaining; {self.done} of {n_slices} slices are done"
-        how = in_slabs if self.scratch else "all at once"
+        slabs_text = in_slabs if self.scratch else "all at once"
         *several, z, y, x = self.shape
-        what = f"{'volumes':<10}{several[0]} of " if several else f"{'volume':<10}"
+        volumes_text = f"{'volumes':<10}{several[0]} of " if several else f"{'volume':<10}"
         return [
-            f"{what}{z} x {y} x {x} voxels with {self.method}, from {self.views} projections",
-            f"{'memory':<10}{size(self.memory or 0)} of {size(self.allowed)}, {how}",
+            f"{volumes_text}{z} x {y} x {x} voxels with {self.method}, from {self.views} projections",
+            f"{'memory':<10}{size(self.memory or 0)} of {size(self.allowed)}, {slabs_text}",
             f"{'disk':<10}{size(self.output)} for the result, {size(self.scratch)} for temporary files; "
             f"{size(self.free)} free",
             f"{'time':<10}{self._time()}",
@@ -68,9 +68,9 @@ class Estimate(Need):
     def _time(self) -> str:
         if self.seconds is None or self.least_seconds is None:
             return f"not known, because the time of {self.method} cannot be predicted"
-        most, least = (f"about {duration_text(seconds)}" for seconds in (self.seconds, self.least_seconds))
-        early = f"{most}; {least} if the method ends early with these data"
-        span = early if self.least_seconds < self.seconds else most
+        most_text, least_text = (f"about {duration_text(seconds)}" for seconds in (self.seconds, self.least_seconds))
+        early = f"{most_text}; {least_text} if the method ends early with these data"
+        span = early if self.least_seconds < self.seconds else most_text
         return f"{span}; reading and correction not counted"
 
 
@@ -139,8 +139,8 @@ def _seconds(
     # the sum counts the overlap of slabs twice
     share = sum(slab.slices.stop - slab.slices.start for slab in missing) / grid.shape[0]
     bars = 1 + options.uncertainty  # the error bars take at most as long as the volume
-    least, most = (bars * (choice + share * each(expected.volumes.values())) for each in (min, max))
-    return least, most
+    least_seconds, most_seconds = (bars * (choice + share * each(expected.volumes.values())) for each in (min, max))
+    return least_seconds, most_seconds
 
 
 def _refuse_scan(scan: SelectedScan) -> None:

@@ -249,7 +249,7 @@ def with_error_bars(job: Job, result: Reconstruction, decided: Decisions) -> Rec
     method = {each.name: each for each in method.alternatives}.get(result.method, method)
     control = RunControl(job.stop, job.listener(), now=job.channels.clock.now)
 
-    why = "their computation was stopped"
+    reason = "their computation was stopped"
     try:
         if job.slabs:
             deviation = deviation_by_slabs(
@@ -258,9 +258,9 @@ def with_error_bars(job: Job, result: Reconstruction, decided: Decisions) -> Rec
         else:
             deviation = deviation_of(result.volume, method, job.prepared.views, job.options, decided.made, control)
     except ValueError as error:  # do not discard a volume that may have taken hours
-        deviation, why = None, str(error)
+        deviation, reason = None, str(error)
     if deviation is None:
-        job.channels.warn(f"No error bars were computed: {why}. The volume is complete.")
+        job.channels.warn(f"No error bars were computed: {reason}. The volume is complete.")
         return result
     factors = method_on_voxels(method, decided.made).error_bars
     assert factors is not None

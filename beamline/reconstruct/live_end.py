@@ -50,8 +50,8 @@ def ended(live: LiveScan, state: Feeds, scan: SelectedScan, usable: UsableViews)
             "before or after the jump."
         )
     table = live.source.table
-    why = _SEVERAL_PARTS if table.part_starts.size > 1 else _OUTDATED if outdated(state.correction) else _OFFSET
-    state = corrected_again(live, state, usable, why, table.offset_views)
+    reason = _SEVERAL_PARTS if table.part_starts.size > 1 else _OUTDATED if outdated(state.correction) else _OFFSET
+    state = corrected_again(live, state, usable, reason, table.offset_views)
     return LastFit(_prepared(live, state, scan, usable), state.fit, state.axis_col, state.history)
 
 

@@ -23,9 +23,8 @@ from recon.splatting.stream import StreamingFit
 
 _ONE_VIEW = np.zeros(1)  # rad
 BATCH_VIEWS = 32  # number of projections that are corrected before the fit continues
-_BEHIND = (
-    0.5  # steps per projection; below this, FBP matches the projections better (tests/bench/test_live_accuracy.py)
-)
+# steps per projection; below this, FBP matches the projections better (tests/bench/test_live_accuracy.py)
+_BEHIND = 0.5
 _AXIS_MOVES = 1.0  # px; a larger change of the axis restarts the fit
 
 # Reasons to correct all projections again.
@@ -216,24 +215,24 @@ def corrected_again(
     ids = np.concatenate([batch.view_ids for batch in state.batches])
     usable_indices = np.flatnonzero(np.isin(ids, usable.frames))
     frames = ids[usable_indices]
-    gone = ids.size - frames.size
+    n_lost = ids.size - frames.size
     shaded = ignores_shadow(correction, frames)
-    if not (gone or shaded or wide.size or outdated(correction) or source.table.part_starts.size > 1):
+    if not (n_lost or shaded or wide.size or outdated(correction) or source.table.part_starts.size > 1):
         return state
     if shaded:
         why = _SHADED
-    if gone:
+    if n_lost:
         why = (
-            f"The fit continues without {count(gone, 'projection')} that the monitor has flagged meanwhile, or that "
+            f"The fit continues without {count(n_lost, 'projection')} that the monitor has flagged meanwhile, or that "
             "the scan has taken again"
         )
     live.enter("correcting", why)
     state.batches.clear()  # free the memory of the old line integrals first
-    correction = new_correction(live, correction.plan.scan.renewed(), every := np.union1d(frames, wide))
-    again = apply(correction.plan, every, warn=live.warn)
-    state.batches.append(again)
-    ordinary = again.measured[~np.isin(again.view_ids, wide)] if wide.size else again.measured
-    state.fit.replace_views(ordinary, usable_indices if gone else None)
+    correction = new_correction(live, correction.plan.scan.renewed(), all_frames := np.union1d(frames, wide))
+    corrected = apply(correction.plan, all_frames, warn=live.warn)
+    state.batches.append(corrected)
+    ordinary = corrected.measured[~np.isin(corrected.view_ids, wide)] if wide.size else corrected.measured
+    state.fit.replace_views(ordinary, usable_indices if n_lost else None)
     return replace(state, correction=correction)
 
 

@@ -115,8 +115,8 @@ class ReconMemory:
         """Memory of the figures of merit for a volume on disk; 0 if it is less than `_ASIDE`, which is not counted. FBP
         needs less.
         """
-        most = judge_memory(self.geometry, fitted=self.method.fitted)
-        return most if most > _ASIDE else 0
+        judge_bytes = judge_memory(self.geometry, fitted=self.method.fitted)
+        return judge_bytes if judge_bytes > _ASIDE else 0
 
     @property
     def least(self) -> int:

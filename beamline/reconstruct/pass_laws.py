@@ -64,14 +64,16 @@ class PassLaws:
         try:
             geometry, _ = self._views.geometry(state.axis_col, rows)
             open_beam = flats_as_projections(state.correction.plan, _NOISE_FLATS)
-            law, gained = measured_law(np.stack([*images.values()]), geometry, views_at_ends, self._rng, open_beam)
+            error_law, gained = measured_law(
+                np.stack([*images.values()]), geometry, views_at_ends, self._rng, open_beam
+            )
         except (ValueError, DataError, MemoryError) as error:
             self._no_law(ends.size, rows.size, str(error) or "there is not enough memory")
             return
-        if (self._views.source.table.offset_views < end).any() and law.offset < 1:
-            law = replace(law, noise=law.noise / (1 - law.offset), offset=0.0)
+        if (self._views.source.table.offset_views < end).any() and error_law.offset < 1:
+            error_law = replace(error_law, noise=error_law.noise / (1 - error_law.offset), offset=0.0)
         self._warn.withdraw(_NO_GAIN)
-        self._sink(LawMeasured(ends.size, **vars(law), gained=gained, time=self._clock.now()))
+        self._sink(LawMeasured(ends.size, **vars(error_law), gained=gained, time=self._clock.now()))
 
     def _no_law(self, number: int, n_views: int, why: str) -> None:
         self._warn(f"{_NO_GAIN}: {why}.")

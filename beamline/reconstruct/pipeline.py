@@ -192,9 +192,9 @@ def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_st
                     "stopped before there were enough projections for a volume; nothing was written"
                 )
             return False
-        if why := writer.lost(clock.now(), grew, lambda: follower.source.finished):
+        if reason := writer.lost(clock.now(), grew, lambda: follower.source.finished):
             raise DataError(
-                f"{follower.source.path} {why} and is not finished. {next_step(follower.source.path)} To use the "
+                f"{follower.source.path} {reason} and is not finished. {next_step(follower.source.path)} To use the "
                 f"{count(follower.views.n, 'projection')} in the file, replace --follow by --unfinished."
             )
         follower.measure_law()

@@ -200,8 +200,8 @@ def box_around_sample(scan: SelectedScan) -> Region:
     rows, side = selection.detector_rows, selection.binning
     height, width = (rows.stop - rows.start) // side, source.shape[1] // side
     coarse = max(1, min(width // _COLUMNS, height))
-    every = max(1, source.table.views.size // _VIEWS)
-    views = f"every:{every}" if selection.views == "all" else selection.views
+    stride = max(1, source.table.views.size // _VIEWS)
+    views = f"every:{stride}" if selection.views == "all" else selection.views
     unlearnt = (type(step)() for step in geometry_steps(selection))
     look = scan.selecting(replace(selection.asked, views=views, binning=side * coarse).with_steps(*unlearnt))
     # the same warnings are given again when the projections are prepared for the volume
@@ -220,16 +220,16 @@ def box_around_sample(scan: SelectedScan) -> Region:
     smooth = ndimage.uniform_filter(data, (1, min(3, data.shape[1]), 3))
     least = _least(smooth)
     material = np.asarray(smooth > least)  # [view, row, col]
-    there = np.flatnonzero(material.any(axis=2).mean(axis=0) >= _SEEN)
-    if not there.size:
+    rows_with_material = np.flatnonzero(material.any(axis=2).mean(axis=0) >= _SEEN)
+    if not rows_with_material.size:
         raise DataError(
             f"{source.path}: --roi auto finds no sample above the noise in {len(data)} projections. Give the box as "
             "numbers, or leave out --roi. Nothing was written."
         )
-    hull = _hull(material[:, there], geometry, grid, coarse)
+    hull = _hull(material[:, rows_with_material], geometry, grid, coarse)
     if not hull.any():
         return _uncut(height, across, "the projections do not agree about the position of the sample")
-    z = _widened(_extent(there, coarse), height, coarse)
+    z = _widened(_extent(rows_with_material, coarse), height, coarse)
     y, x = (_widened(_extent(np.flatnonzero(hull.any(axis=axis)), coarse), across, coarse) for axis in (1, 0))
     region = Region(z, y, x, requested=False)
     share = np.prod([end - first for first, end in (z, y, x)]) / (height * across**2)
@@ -267,9 +267,9 @@ def _hull(material: Mask, geometry: Geometry, grid: Grid, coarse: int) -> Mask:
         first = np.where(shadow, cols, cols.size).min(axis=1)
         last = np.where(shadow, cols, -1).max(axis=1)
         # A shadow at the edge may continue beyond it. A view without a shadow does not show the position of the sample.
-        unknown = last < 0
-        low = np.where((first <= 1) | unknown, -np.inf, first - 1 - geometry.axis_col)
-        high = np.where((last >= cols.size - 2) | unknown, np.inf, last + 1 - geometry.axis_col)
+        is_empty = last < 0
+        low = np.where((first <= 1) | is_empty, -np.inf, first - 1 - geometry.axis_col)
+        high = np.where((last >= cols.size - 2) | is_empty, np.inf, last + 1 - geometry.axis_col)
         within = np.zeros((n, n), np.int32)
         for angle, left, right in zip(geometry.angles.tolist(), low.tolist(), high.tolist(), strict=True):
             across = np.cos(angle) * positions[None, :] + np.sin(angle) * positions[:, None]

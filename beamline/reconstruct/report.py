@@ -76,14 +76,14 @@ def _summary(outcome: MadeVolume, metrics: Mapping[str, Mapping[str, float]]) ->
     best = "psnr" if truth is not None else "residual"
     own = metrics[result.method]
     best = best if best in own else "seconds"  # FBP of a region has no figures of quality
-    shape, what = " × ".join(str(n) for n in result.volume.grid.shape), f"{name} volume of"
+    shape, volumes_text = " × ".join(str(n) for n in result.volume.grid.shape), f"{name} volume of"
     if result.series is not None:
         seconds = result.series.seconds
         first_time = seconds[0]
         last_time = seconds[-1]
-        what = f"{len(seconds)} volumes at successive times, {first_time:.4g} to {last_time:.4g} s, of"
+        volumes_text = f"{len(seconds)} volumes at successive times, {first_time:.4g} to {last_time:.4g} s, of"
     summary = (
-        f"{what} {shape} voxels from {geometry.n_views} of {prepared.origin.n_projections} projections in "
+        f"{volumes_text} {shape} voxels from {geometry.n_views} of {prepared.origin.n_projections} projections in "
         f"{result.seconds:.1f} s; {METRICS[best].label} {formatted(best, own[best])}"
     )
     if BASELINE in metrics and result.method != BASELINE:
@@ -242,8 +242,8 @@ def _displaced(result: Reconstruction, moved: Volume) -> str:
     if not material.any():
         return ""
     voxels = np.sqrt(np.square(result.displacement[:, material]).sum(0)) / result.volume.grid.voxel_size
-    middle, most = np.percentile(voxels, (50, 99))
-    return f" The material of the reference was displaced by {middle:.1f} voxels (median), at most {most:.1f}."
+    middle, highest = np.percentile(voxels, (50, 99))
+    return f" The material of the reference was displaced by {middle:.1f} voxels (median), at most {highest:.1f}."
 
 
 def _doubts(

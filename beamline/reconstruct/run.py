@@ -115,11 +115,11 @@ def fit_within(
     measuring = _MEASURING * limit
     remaining = limit - spent - measuring - after
     if remaining <= 0:
-        rest = duration_text(measuring + after)
+        measuring_text = duration_text(measuring + after)
         warn(
             f"{duration_text(limit)} is not enough for this scan: reading and correction took "
-            f"{duration_text(spent)}, and checks, report and writing need about {rest}. No time is left for the "
-            f"{by_name(method.name).label} method, so it makes only one step."
+            f"{duration_text(spent)}, and checks, report and writing need about {measuring_text}. No time is left for "
+            f"the {by_name(method.name).label} method, so it makes only one step."
         )
     before_report = Stop(deadline=started[0] + limit - after, now=clock.now)
     return with_settings(method, {"seconds": max(remaining, 0.0)}), before_report

@@ -98,11 +98,11 @@ def reference_images(source: ScanSource) -> dict[str, NDArray[np.float32]]:
 def _ranked(flags: FrameFlags, check: int, entry: FlagBit, level: Level) -> list[int]:
     rows = flags.rows(entry, level)
     rows = rows[np.argsort(-np.abs(flags.scores[rows, check]), kind="stable")]
-    apart: list[int] = []
+    ranked: list[int] = []
     for row in rows.tolist():
-        if all(abs(row - shown_row) >= APART for shown_row in apart):
-            apart.append(row)
-    return apart[:MOST]
+        if all(abs(row - shown_row) >= APART for shown_row in ranked):
+            ranked.append(row)
+    return ranked[:MOST]
 
 
 def _frame(source: ScanSource, flags: FrameFlags, row: int) -> FlaggedFrame:
@@ -226,9 +226,9 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
     table = _table(source, sample or "not stated", columns)
     table["flagged by the monitor"] = "not checked by the monitor" if flags is None else counted(flags.counts())
     table |= {str(k): as_text(v) for k, v in attributes.items() if len(str(v)) <= 200 and str(k) not in table}
-    n, again = len(source.table), source.table.replaced
-    if again.size:
-        table["views taken again"] = f"{again.size}, because of an alarm; not used: {frames_text(again)}"
+    n, replaced = len(source.table), source.table.replaced
+    if replaced.size:
+        table["views taken again"] = f"{replaced.size}, because of an alarm; not used: {frames_text(replaced)}"
     dropped = sum(int(decision.get("dropped") or 0) for decision in source.decisions)
     remarks = [*filter(None, [ended_by(source.decisions)]), *([] if flags is None else reasons(flags))]
     return ScanFacts(

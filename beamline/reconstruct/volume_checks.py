@@ -98,9 +98,9 @@ def check_volume(outcome: MadeVolume, sink: Sink, clock: Clock) -> CheckedVolume
     if fitted and BASELINE in volumes:
         tell(_lost_material(result, prepared, volumes[BASELINE]))
     if skipped:
-        why = "the reconstruction was stopped" if result.ending.early else "the time limit was nearly reached"
+        reason = "the reconstruction was stopped" if result.ending.early else "the time limit was nearly reached"
         skipped_checks = ", ".join(skipped)
-        text = f"These checks were left out, because {why}: {skipped_checks}."
+        text = f"These checks were left out, because {reason}: {skipped_checks}."
         sink(StateEntered("left_out", text, time=clock.now()))
     return CheckedVolume(judgement, volumes, metrics, warnings, hiding, text if skipped else "")
 

@@ -254,10 +254,8 @@ def change(
     )
     first = looked.start or 0
     slice_number, grid = first + int(np.argmax([np.square(part).sum() for part in change.data[looked]])), volume.grid
-    window, most = (
-        material_window(volume.data[slice_number]),
-        float(np.percentile(np.abs(change.data[slice_number]), 99.5)) or 1.0,
-    )
+    window = material_window(volume.data[slice_number])
+    largest_change = float(np.percentile(np.abs(change.data[slice_number]), 99.5)) or 1.0
     down, across = (1, 3) if unexplained is None else (2, 2)
     figure = new_figure((WIDTH, 3.4 * down), dpi_for(grid.shape[2], WIDTH / 1.3 / across))
     panels = [
@@ -268,7 +266,7 @@ def change(
             "gray",
         ),
         (volume.data[slice_number], f"Volume, slice {slice_number}", window, "gray"),
-        (change.data[slice_number], f"Change ({kind.unit(unit)})", (-most, most), "RdBu_r"),
+        (change.data[slice_number], f"Change ({kind.unit(unit)})", (-largest_change, largest_change), "RdBu_r"),
     ]
     if unexplained is not None:
         panels.append(

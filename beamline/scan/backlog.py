@@ -87,7 +87,7 @@ def hold_for_backlog(pause: PauseRequest, limit: int, waiting: int, checking: fl
             is too slow.
     """
     if 4 * waiting >= 3 * limit:
-        what, advice = (
+        cause, advice = (
             ("The disk is too slow", "a longer period_s or a faster disk")
             if writing > checking
             else (
@@ -97,7 +97,7 @@ def hold_for_backlog(pause: PauseRequest, limit: int, waiting: int, checking: fl
         )
         pause.hold(
             Cause.BACKLOG,
-            f"{what}: {waiting} of at most {limit} frames wait in memory. The scan pauses, and continues "
+            f"{cause}: {waiting} of at most {limit} frames wait in memory. The scan pauses, and continues "
             f"automatically when most of these frames are written. To avoid such pauses, use {advice}",
         )
     elif 4 * waiting <= limit:

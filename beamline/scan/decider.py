@@ -68,13 +68,18 @@ class Decider:
     _answers: frozenset[Choice] = frozenset()  # choices that the operator can make at present
     _answer: Choice | None = None
 
-    def add_law(self, law: LawMeasured) -> None:
+    def add_law(self, error_law: LawMeasured) -> None:
         """Receive an error model from the live reconstruction. The method may be called in any thread."""
-        self._law = law
-        option = self._chosen.get(law.number - 1, {})
-        if law.gained is not None and option.get("choice", Choice.NEXT) in (Choice.NEXT, Choice.AGAIN):
-            ends = {"gained_low": (1 - BELOW) * law.gained, "gained_high": (1 + BELOW) * law.gained}
-            self._outcome = {"predicted": option.get("gain"), "gained": law.gained, **ends, "judged": law.number - 1}
+        self._law = error_law
+        option = self._chosen.get(error_law.number - 1, {})
+        if error_law.gained is not None and option.get("choice", Choice.NEXT) in (Choice.NEXT, Choice.AGAIN):
+            ends = {"gained_low": (1 - BELOW) * error_law.gained, "gained_high": (1 + BELOW) * error_law.gained}
+            self._outcome = {
+                "predicted": option.get("gain"),
+                "gained": error_law.gained,
+                **ends,
+                "judged": error_law.number - 1,
+            }
 
     def answer(self, choice: Choice) -> None:
         """Receive the operator's choice. The method may be called in any thread. If the choice is not possible, a
@@ -94,12 +99,15 @@ class Decider:
         self.number += 1
         if self._no_more_laws:
             return Choice.NEXT
-        law, offered = self._predict(passes)
+        error_law, offered = self._predict(passes)
         if self.stop.stopping:
             return Choice.NEXT
-        if law is not None:
+        if error_law is not None:
             used = self._used_so_far(passes)
-            decided_by, (choice, reason) = "program", choose(offered, self.target, remaining_gain(passes, law), *used)
+            decided_by, (choice, reason) = (
+                "program",
+                choose(offered, self.target, remaining_gain(passes, error_law), *used),
+            )
         else:
             decided_by, choice, self._no_more_laws = "plan", Choice.NEXT, self.why_no_law()
             reason = (
@@ -107,10 +115,8 @@ class Decider:
                 or (self._law.reason if self._law.number == self.number else "")
                 or f"no prediction within {self.wait:g} s"
             )
-        asks, remark = (
-            self.asks and not self._no_more_laws,
-            "" if law else f"The expected improvement is not known: {reason}.",
-        )
+        asks = self.asks and not self._no_more_laws
+        remark = "" if error_law else f"The expected improvement is not known: {reason}."
         pass_values, n_passes = (self.number, passes.n_frames // self.timeline.plan.frames_per_view), len(passes.done)
         rows = [  # an event has None for NaN
             {name: None if value != value else value for name, value in vars(option).items()} for option in offered
@@ -136,20 +142,20 @@ class Decider:
 
         If an earlier error model makes the next pass certain, it is used, so that the stage does not wait.
         """
-        law = self._newest_law(passes)
-        offered = options(passes, law, self.timeline, self.seconds_of)
+        error_law = self._newest_law(passes)
+        offered = options(passes, error_law, self.timeline, self.seconds_of)
         if (
-            law is None
+            error_law is None
             or self.asks
             or self.why_no_law()
-            or not next_is_sure(passes, offered, self.target, law, *self._used_so_far(passes))
+            or not next_is_sure(passes, offered, self.target, error_law, *self._used_so_far(passes))
         ):
             if not self._law_is_known():
                 self.close_shutter()  # computing an error model takes seconds
                 self._wait(self._law_is_known)
-            law = self._newest_law(passes) if self._law.number == self.number else None
-            offered = options(passes, law, self.timeline, self.seconds_of)
-        return law, offered
+            error_law = self._newest_law(passes) if self._law.number == self.number else None
+            offered = options(passes, error_law, self.timeline, self.seconds_of)
+        return error_law, offered
 
     def _law_is_known(self) -> bool:
         """True if the error model of all projections so far has arrived, or if no error model can come."""

@@ -99,13 +99,13 @@ class DryRun:
             lines.append(f"{'states':<10}{self._states_in_words()}")
         if needs.dose_gy is not None:
             lines.append(f"{'dose':<10}{needs.dose_gy:.4g} Gy")
-        return [*lines, *(f"{'operator':<10}{what}, {count(times, 'time')}" for what, times in needs.operator)]
+        return [*lines, *(f"{'operator':<10}{request}, {count(times, 'time')}" for request, times in needs.operator)]
 
     def _states_in_words(self) -> str:
-        longest, every = max(needs.duration for needs in self.states), self.state_interval
-        when = "at the next `beamline resume`" if every is None else f"one every {hms_text(every)}"
-        late = every is not None and longest > every
-        more = f"; a state takes {hms_text(longest)}, so the next state begins later than planned" if late else ""
+        longest, interval = max(needs.duration for needs in self.states), self.state_interval
+        when = "at the next `beamline resume`" if interval is None else f"one every {hms_text(interval)}"
+        is_late = interval is not None and longest > interval
+        more = f"; a state takes {hms_text(longest)}, so the next state begins later than planned" if is_late else ""
         return (
             f"{len(self.states)}, with one scan of this plan for each state, {when}: {hms_text(self.needs.duration)} "
             f"and {size(self.needs.total_bytes)} in total{more}"
@@ -273,11 +273,11 @@ def _of_series(settings: Config, configs: Sequence[Config], dry_runs: Sequence[D
         parts = {**total.needs.parts, "wait": breaks}
         needs_with_waits = replace(total.needs, parts=parts)
         total = replace(total, states=tuple(state_needs), state_interval=states.every_s, needs=needs_with_waits)
-    what = "energies" if states is None else "states"
+    kind = "energies" if states is None else "states"
     violations = dict.fromkeys(limit for scan in dry_runs for limit in scan.timeline.violations)
     if total.needs.total_bytes * ROOM > total.free_bytes:
         violations[
-            f"free some space, choose another storage.folder, or set fewer {what}: {len(dry_runs)} {what} need "
+            f"free some space, choose another storage.folder, or set fewer {kind}: {len(dry_runs)} {kind} need "
             f"{size(total.needs.total_bytes)} plus a reserve of a tenth, and the disk has {size(total.free_bytes)} "
             "free"
         ] = None

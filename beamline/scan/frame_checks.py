@@ -96,14 +96,14 @@ class FrameChecks:
         """A frame with its statistics and flags. If there was an error, the error is returned, and raised when the
         frame should be written.
         """
-        begun = time.monotonic()
+        start_time = time.monotonic()
         try:
             frame_digest, stored_digest = digests(frame.counts, self._monitor.context.saturation, self._preview_bin)
             return frame, frame_digest, stored_digest, self._flags_of(_as_stored(frame), frame_digest)
         except BaseException as error:
             return error
         finally:
-            self.busy += time.monotonic() - begun
+            self.busy += time.monotonic() - start_time
 
     def next(self) -> CheckedItem:
         """The next checked item. If the checks hang, the thread that calls computes the statistics itself."""

@@ -85,19 +85,19 @@ def live_need(shape: tuple[int, int], n_views: int, free: int) -> str:
     """A sentence about the live volume: its projections and pixels, its memory, and the reason for its size."""
     plan = live_plan(shape, n_views, free)
     rows, cols = (max(1, n // plan.binning) for n in shape)
-    views, most = math.ceil(n_views / plan.one_in), f"half of the {size(free)} of free memory"
+    views, share_text = math.ceil(n_views / plan.one_in), f"half of the {size(free)} of free memory"
     need = (
         f"the live volume uses {count(views, 'projection')} of {rows} x {cols} pixels and about "
         f"{size(plan.bytes)} of memory"
     )
     if plan.whole:
-        return f"{need}; at most {most} is allowed"
-    how = [f"one projection in {plan.one_in}"] if plan.one_in > 1 else []
-    how += [f"pixels binned {plan.binning} x {plan.binning}"] if plan.binning > 1 else []
+        return f"{need}; at most {share_text} is allowed"
+    reductions = [f"one projection in {plan.one_in}"] if plan.one_in > 1 else []
+    reductions += [f"pixels binned {plan.binning} x {plan.binning}"] if plan.binning > 1 else []
     whole = f"all {n_views} projections of {shape[0]} x {shape[1]} would need {size(live_bytes(shape, n_views))}"
     wide = f"at most {_WIDEST} columns and " if shape[1] > _WIDEST else ""
-    what_to_change = ", ".join(how)
+    what_to_change = ", ".join(reductions)
     return (
-        f"{need} ({what_to_change}). The reason: the live volume may use {wide}{most}, but {whole}. `beamline recon` "
-        "makes the full volume"
+        f"{need} ({what_to_change}). The reason: the live volume may use {wide}{share_text}, but {whole}. `beamline "
+        "recon` makes the full volume"
     )

@@ -191,7 +191,7 @@ class LiveReconstruction:
         command: Sequence[str],
         log: Path,
         sink: Sink,
-        on_law: Callable[[LawMeasured], None] = lambda law: None,
+        on_law: Callable[[LawMeasured], None] = lambda error_law: None,
         what: str = "live reconstruction",
         silence: float = _SILENCE,
         low_priority: bool = True,

@@ -123,9 +123,9 @@ class QueuePlan:
         of_scans = [_fault_line(scan, fault) for scan in self.scans for fault in scan.faults]
         if of_scans or self.faults:
             bad = count(sum(not scan.valid for scan in self.scans), "scan")
-            what = f"{bad} of {len(self.scans)} cannot run" if of_scans else "the scans do not fit on the disk"
+            failure = f"{bad} of {len(self.scans)} cannot run" if of_scans else "the scans do not fit on the disk"
             lines = [f"\n  {line}" for line in (*of_scans, *map(str, self.faults))]
-            raise ConfigError("".join([f"Nothing was started, because {what}:", *lines]))
+            raise ConfigError("".join([f"Nothing was started, because {failure}:", *lines]))
 
 
 def queue_of(scans: Iterable[PlannedScan]) -> QueuePlan:

@@ -174,7 +174,7 @@ class Recorder:
         """The second thread: writes frames and reports them."""
         item, flushed = self._checks.next(), True
         while True:
-            begun = time.monotonic()
+            start_time = time.monotonic()
             try:
                 if isinstance(item, BaseException):
                     raise item
@@ -194,7 +194,7 @@ class Recorder:
                 with suppress(BaseException):  # the first error counts
                     self._writer.flush()  # the frames before it
                 self._failure = self._failure or error
-            self._write_seconds += time.monotonic() - begun
+            self._write_seconds += time.monotonic() - start_time
             self._writing_since = math.inf
             if item is None:
                 return

@@ -228,10 +228,10 @@ def _refuse_complete(run: Path, parts: list[Path], closed: bool) -> None:
     whole = f"{run} has all projections, darks and flats that were planned"
     if closed and (len(parts) == 1 or is_joined(run / JOINED)):
         raise NothingMissing(f"{whole}: nothing is missing. {_UNTOUCHED}")
-    what = (
+    problem = (
         f"{JOINED} does not have all frames of the {len(parts)} parts of the run" if closed else "a file was not closed"
     )
-    raise NotJoined(f"{whole}, but {what}: `beamline recover {run}` fixes that. {_UNTOUCHED}")
+    raise NotJoined(f"{whole}, but {problem}: `beamline recover {run}` fixes that. {_UNTOUCHED}")
 
 
 def _files(run: Path) -> tuple[list[Path], list[str]]:
@@ -297,8 +297,8 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
     with _locked(run) if (run / EVENTS).is_file() else nullcontext():  # no process works on the copies of the files
         files, left_out = _files(run)
         if not files:
-            why = f"has no frame: {left_out[0]}" if left_out else f"is not the folder of a run: it has no {SCAN}."
-            raise DataError(f"{run} {why} {_UNTOUCHED}")
+            reason = f"has no frame: {left_out[0]}" if left_out else f"is not the folder of a run: it has no {SCAN}."
+            raise DataError(f"{run} {reason} {_UNTOUCHED}")
         recovered = [recover(part, say) for part in files]
         if len(parts := [result.path for result in recovered if result.frames]) > 1:
             changed = not is_joined(run / JOINED)

@@ -243,12 +243,12 @@ def _set_aside(files: Sequence[Path], part: str, states: StateMachine, sink: Sin
     their names.
     """
     for path in filter(os.path.lexists, files):
-        aside = path.with_stem(f"{path.stem}.before-{part}")
+        renamed = path.with_stem(f"{path.stem}.before-{part}")
         try:
-            path.rename(aside)
+            path.rename(renamed)
             sink(
                 StateEntered(
-                    states.state, f"{path.name}, the volume of the earlier projections, was renamed to {aside.name}"
+                    states.state, f"{path.name}, the volume of the earlier projections, was renamed to {renamed.name}"
                 )
             )
         except OSError as error:  # happens on Windows if a viewer has the file open

@@ -182,14 +182,14 @@ class _Turns:
         )  # fmt: skip
         name, due = _scan_name(measurement.config), clock.now()
         if self.last_begin is not None and self.interval is not None:
-            due, late = self.last_begin + self.interval, due - self.last_begin - self.interval
-            if late > SLICE:
+            due, lateness = self.last_begin + self.interval, due - self.last_begin - self.interval
+            if lateness > SLICE:
                 measurement.sink(
-                    Warned(f"{name} begins {late:.0f} s late, because the scan of the state before took longer.")
+                    Warned(f"{name} begins {lateness:.0f} s late, because the scan of the state before took longer.")
                 )
                 due = clock.now()
             else:
-                states.enter(states.state, f"{name} begins in {-late:.0f} s")
+                states.enter(states.state, f"{name} begins in {-lateness:.0f} s")
             while (remaining := due - clock.now()) > 0 and not stop.stopping:
                 clock.sleep(min(SLICE, remaining))
         elif self.last_begin is not None:
@@ -206,10 +206,10 @@ class _Turns:
 
 def _with_time_limit(config: Config, seconds: float | None) -> Config:
     """The configuration of a state, changed so that its live volume is finished before the next state begins."""
-    every = config.scan.states.every_s if config.scan.states else None
-    if every is None or seconds is None:
+    interval_s = config.scan.states.every_s if config.scan.states else None
+    if interval_s is None or seconds is None:
         return config
-    spare = max(every - seconds, _LEAST_SECONDS)
+    spare = max(interval_s - seconds, _LEAST_SECONDS)
     return changed(config, [override_of("recon.seconds", min(config.recon.seconds, spare))])
 
 

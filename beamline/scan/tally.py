@@ -120,8 +120,8 @@ def _block_discrepancies(tally: BlockTally) -> str:
     if tally.missing and not tally.is_retake:
         n = len(tally.missing)
         angles = np.degrees(block.angles[tally.missing])
-        at = "" if np.isnan(angles).any() else f" (from {angles[0]:.4g}° to {angles[-1]:.4g}°)"
-        text = f"{n} of {block.n} {noun}s {'is' if n == 1 else 'are'} missing: {spans(tally.missing)}{at}."
+        angles_text = "" if np.isnan(angles).any() else f" (from {angles[0]:.4g}° to {angles[-1]:.4g}°)"
+        text = f"{n} of {block.n} {noun}s {'is' if n == 1 else 'are'} missing: {spans(tally.missing)}{angles_text}."
         if tally.lost:
             text += (
                 f" {tally.lost} were exposed but never delivered by the camera: `beamline check --connect` tests the "

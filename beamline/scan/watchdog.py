@@ -120,12 +120,12 @@ class _Keeper:
                 continue
             code = self._process.code
             if code == ACTED:
-                why = (
+                reason = (
                     f"the process did nothing for {FROZEN:.0f} s, so the watchdog stopped the stage and "
                     "closed the shutter"
                 )
-                self._sink(Warned(f"Failed: {why}. The scan ends."))
-                stop.abort(why)
+                self._sink(Warned(f"Failed: {reason}. The scan ends."))
+                stop.abort(reason)
                 return
             self._process.end()
             if not restarts_left:

@@ -198,15 +198,15 @@ def resolve(group: h5py.Group, path: str) -> Any | None:
 
 def broken_link(group: h5py.Group, path: str) -> str:
     """A sentence that names the target of the broken link at which a path ends; "" if no link is broken."""
-    here: Any = group
+    item: Any = group
     for name in path.strip("/").split("/"):
-        if not isinstance(here, h5py.Group):
+        if not isinstance(item, h5py.Group):
             return ""
-        link, there = here.get(name, getlink=True), resolve(here, name)
-        if there is None and isinstance(link, h5py.SoftLink | h5py.ExternalLink):
+        link, target = item.get(name, getlink=True), resolve(item, name)
+        if target is None and isinstance(link, h5py.SoftLink | h5py.ExternalLink):
             file = f"{link.filename}::" if isinstance(link, h5py.ExternalLink) else ""
-            return f"{here.name.rstrip('/')}/{name} is a link to {file}{link.path}, which does not exist"
-        here = there
+            return f"{item.name.rstrip('/')}/{name} is a link to {file}{link.path}, which does not exist"
+        item = target
     return ""
 
 
@@ -298,8 +298,8 @@ def radians(item: h5py.Dataset, unit: str | None = None, default: str = "") -> N
     where = f"{item.name} in {item.file.filename}"
     angles, stated = _numbers(item)
     if angles is None:
-        found = _SORTS.get(item.dtype.kind, item.dtype)
-        raise DataError(f"{where} contains {found}; expected integers or real numbers.")
+        type_name = _SORTS.get(item.dtype.kind, item.dtype)
+        raise DataError(f"{where} contains {type_name}; expected integers or real numbers.")
     unit = unit or " and ".join(sorted(stated)) or default
     factor = factor_of(unit, ANGLE_UNITS)
     if factor is None:
@@ -445,5 +445,5 @@ _SORTS = {"c": "complex numbers", "b": "Boolean values", "V": "records", "O": "t
 def require_real(dtype: np.dtype[Any], what: str) -> None:
     """Raise DataError if pixels, keys or angles are not real numbers, for example text or complex numbers."""
     if dtype.kind not in "uif":
-        found = _SORTS.get(dtype.kind, str(dtype))
-        raise DataError(f"{what} contains {found}; expected integers or real numbers.")
+        type_name = _SORTS.get(dtype.kind, str(dtype))
+        raise DataError(f"{what} contains {type_name}; expected integers or real numbers.")

@@ -187,8 +187,8 @@ def reserve(descriptor: int, wanted: int, folder: Path) -> None:
     Raises:
         DataError: the disk does not have enough free space.
     """
-    there, free = os.fstat(descriptor), shutil.disk_usage(folder).free
-    taken = 512 * getattr(there, "st_blocks", (there.st_size + 511) // 512)
+    status, free = os.fstat(descriptor), shutil.disk_usage(folder).free
+    taken = 512 * getattr(status, "st_blocks", (status.st_size + 511) // 512)
     still_needed = size(wanted - taken)
     refusal = (
         f"Write the output to another disk: {folder} has {size(free)} free, and {still_needed} more are needed "

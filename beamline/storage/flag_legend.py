@@ -184,8 +184,8 @@ class FrameFlags:
 
     def without(self, bit: int) -> FrameFlags:
         """The flags without those of one check."""
-        gone = np.array(1 << bit | 1 << bit + ALARM_SHIFT, self.bits.dtype)
-        return replace(self, bits=self.bits & ~gone)
+        removed_bits = np.array(1 << bit | 1 << bit + ALARM_SHIFT, self.bits.dtype)
+        return replace(self, bits=self.bits & ~removed_bits)
 
     def rows(self, entry: FlagBit, level: Level) -> NDArray[np.intp]:
         """Frames that a check flagged at this level."""
@@ -212,11 +212,11 @@ def _greatest(scores: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _box_around(regions: NDArray[np.int32]) -> NDArray[np.int32]:
     """[check, 4] the box around the regions [frame, check, 4]; -1 if no frame has a region."""
-    there = regions[..., :1] >= 0
-    low = np.where(there, regions, np.iinfo(np.int32).max).min(axis=0)
+    has_region = regions[..., :1] >= 0
+    low = np.where(has_region, regions, np.iinfo(np.int32).max).min(axis=0)
     high = regions.max(axis=0)
     box = np.stack([low[:, 0], high[:, 1], low[:, 2], high[:, 3]], axis=1)
-    return np.where(there.any(axis=0), box, -1).astype(np.int32)
+    return np.where(has_region.any(axis=0), box, -1).astype(np.int32)
 
 
 TODAY = tuple(FlagBit(check.name, check.bit, check.unit, check.meaning) for check in CHECKS)

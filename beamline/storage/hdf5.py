@@ -114,12 +114,12 @@ def _unopened(
 
 def grows_here(path: Path) -> bool:
     """True if this program has the file open with HDF5's own driver, to write it or to follow it."""
-    here = path.stat()
+    status = path.stat()
     for file in h5py.h5f.get_obj_ids(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE):
         with suppress(OSError, RuntimeError, ValueError):  # another thread has just closed the file
             by_name = file.get_access_plist().get_driver() != h5py.h5fd.fileobj_driver
             writes = by_name and file.get_intent() != h5py.h5f.ACC_RDONLY
-            if writes and os.path.samestat(here, Path(os.fsdecode(file.name)).stat()):
+            if writes and os.path.samestat(status, Path(os.fsdecode(file.name)).stat()):
                 return True
     return False
 
@@ -196,9 +196,10 @@ def readable(path: Path) -> Iterator[None]:
     except ALTERED as error:
         if isinstance(error, MemoryError | PermissionError | FileNotFoundError) or _of_our_own(error):
             raise
-        what = " ".join(str(error).split()) or "no further information"
+        details = " ".join(str(error).split()) or "no further information"
         raise DataError(
-            f"{path} is damaged or has an unexpected structure ({type(error).__name__}: {what}). Nothing was changed."
+            f"{path} is damaged or has an unexpected structure ({type(error).__name__}: {details}). Nothing was "
+            "changed."
         ) from error
 
 

@@ -104,7 +104,9 @@ def _after_views(files: Sequence[h5py.File]) -> dict[FrameKind, set[int]]:
     table = FrameTable.concat([frames_in(file) for file in files])
     after = table.views[-1] if table.views.size else len(table)
     rows = {kind: table.of_kind(kind) for kind in (FrameKind.FLAT, FrameKind.DARK)}
-    return {kind: set(table.triggers[some[some > after]].tolist()) for kind, some in rows.items()}
+    return {
+        kind: set(table.triggers[rows_of_kind[rows_of_kind > after]].tolist()) for kind, rows_of_kind in rows.items()
+    }
 
 
 def join(parts: Sequence[Path], joined: Path) -> int:
@@ -187,9 +189,9 @@ def require_joined(file: h5py.File) -> None:
     if layout.PART_STARTS not in file or not file[layout.DATA].is_virtual:
         return
     joined = Path(file.filename)
-    if why := _disagreement(file, joined.parent):
+    if reason := _disagreement(file, joined.parent):
         raise DataError(
-            f"{joined} does not have all frames of its scan: {why}. {to_join(joined.parent)}. If parts "
+            f"{joined} does not have all frames of its scan: {reason}. {to_join(joined.parent)}. If parts "
             "are in another place, copy the whole folder of the run. Nothing was changed."
         )
 
@@ -225,9 +227,9 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
     values = {path: [file[path][:n] for file, n in zip(files, rows, strict=True)] for path in grown}
     for i, (file, n, first) in enumerate(zip(files, rows, firsts[:-1], strict=True)):
         record = {path: values[path][i] for path in layout.RECORDED}
-        again = np.setdiff1d(np.flatnonzero(record[layout.REPLACES] >= 0), altered_rows(file, n))
-        record[layout.REPLACES][again] += first
-        values[layout.RECORD_CHECKSUM][i][again] = record_checksums(record)[again]
+        replacing = np.setdiff1d(np.flatnonzero(record[layout.REPLACES] >= 0), altered_rows(file, n))
+        record[layout.REPLACES][replacing] += first
+        values[layout.RECORD_CHECKSUM][i][replacing] = record_checksums(record)[replacing]
     values |= {path: [file[path][()] for file in files] for path in _READINGS if path in files[-1]}
     if layout.PASS_ENDS in files[0]:
         values[layout.PASS_ENDS] = [pass_ends_in(file) + first for file, first in zip(files, firsts, strict=False)]

@@ -148,15 +148,15 @@ def _of_csv(path: Path, content: str) -> PoseTable:
         )
     _require_header(path, names, cone)
     columns = dict(zip(names, _numbers(path, names, rows).T, strict=True))
-    by = next(name for name in _KEYS if name in columns)
-    keys, angles = columns[by], columns.get("angle_deg")
-    _require_keys(path, columns, by)
+    key_name = next(name for name in _KEYS if name in columns)
+    keys, angles = columns[key_name], columns.get("angle_deg")
+    _require_keys(path, columns, key_name)
     if cone is not None:
         vectors = np.stack([columns[name] for name in _VECTORS[cone]], axis=1)
-        return _of_vectors(path, by, keys, vectors, cone=cone)
-    none = np.zeros(keys.size)
-    shifts, turns = (np.stack([columns.get(name, none) for name in part], axis=1) for part in (_PIXELS, _TURNS))
-    return PoseTable(path, by, keys, angles, shifts, turns)
+        return _of_vectors(path, key_name, keys, vectors, cone=cone)
+    zeros = np.zeros(keys.size)
+    shifts, turns = (np.stack([columns.get(name, zeros) for name in part], axis=1) for part in (_PIXELS, _TURNS))
+    return PoseTable(path, key_name, keys, angles, shifts, turns)
 
 
 def _require_header(path: Path, names: list[str], cone: bool | None) -> None:
@@ -245,9 +245,9 @@ def _of_volume(path: Path, record: ReconRecord) -> PoseTable:
             f"{path} was reconstructed with geometry vectors, but does not contain these vectors: give the file with "
             "the vectors"
         )
-    none, binning = np.zeros(frames.size), int(parameters.get("binning", 1))
+    zeros, binning = np.zeros(frames.size), int(parameters.get("binning", 1))
     shifts = np.asarray(parameters.get("view_shifts_px", np.zeros((frames.size, 2))), np.float64) * binning
-    turns = np.stack([np.asarray(parameters.get(name, none), np.float64) for name in POSES_KEPT[1:]], axis=1)
+    turns = np.stack([np.asarray(parameters.get(name, zeros), np.float64) for name in POSES_KEPT[1:]], axis=1)
     axis = None if "columns" in parameters or "axis_col" not in parameters else float(parameters["axis_col"])
     return PoseTable(path, "frame", frames, angles, shifts, turns, axis_col=axis)
 

@@ -35,11 +35,11 @@ def frames_in(file: h5py.File, n: int | None = None) -> FrameTable:
         ValueError: a column does not have the form that `create` gave it, or a row claims to replace a later row.
     """
     n = int(file[layout.COMMITTED][()]) if n is None else n
-    columns, aside = _record(file, n), None
+    columns, translations = _record(file, n), None
     altered, kinds = _altered(columns), kinds_of(columns[layout.KIND])
     if layout.X_TRANSLATION in file:
-        aside = _column(file, layout.X_TRANSLATION, n)
-        kinds[(kinds == FrameKind.ALIGNMENT) & (aside != 0)] = FrameKind.OFFSET_VIEW
+        translations = _column(file, layout.X_TRANSLATION, n)
+        kinds[(kinds == FrameKind.ALIGNMENT) & (translations != 0)] = FrameKind.OFFSET_VIEW
     kinds[altered] = FrameKind.INVALID
     for path in (layout.TRIGGER, layout.FRAMESTAMP, layout.REPLACES):
         columns[path][altered] = -1
@@ -54,7 +54,7 @@ def frames_in(file: h5py.File, n: int | None = None) -> FrameTable:
         framestamps=columns[layout.FRAMESTAMP],
         times=times if np.isfinite(times).any() else None,
         replaces=replaces if (replaces >= 0).any() else None,
-        aside=aside,
+        aside=translations,
         altered=altered,
         part_starts=_part_starts(file),
         pass_ends=pass_ends_in(file),

@@ -75,7 +75,7 @@ class Recovered:
             order = "cannot be repaired" if wrong else "is intact"
             sentence = f"{self.path} {order}, with {count(self.frames, 'frame')}{wrong}. Nothing was changed."
         else:
-            gone = f", {count(self.dropped, 'incomplete frame')} left out" if self.dropped else ""
+            dropped_text = f", {count(self.dropped, 'incomplete frame')} left out" if self.dropped else ""
             lost = f"; written by the scan but lost on the disk: {frames_text(self.lost)}" if self.lost else ""
             damaged = (
                 f"; pixels differ from the checksum stored with them: {frames_text(self.damaged)}"
@@ -83,7 +83,9 @@ class Recovered:
                 else ""
             )
             views = f"; {count(self.missing, 'planned projection')} not taken" if self.missing else ""
-            sentence = f"{self.path}: {count(self.frames, 'frame')} recovered{gone}{lost}{damaged}{wrong}{views}."
+            sentence = (
+                f"{self.path}: {count(self.frames, 'frame')} recovered{dropped_text}{lost}{damaged}{wrong}{views}."
+            )
         return f"{sentence} {self.remark}".strip()
 
 
@@ -216,16 +218,16 @@ def _frames_there(file: h5py.File) -> int:
     return next((row + 1 for row in good if is_whole(file, row)), 0)
 
 
-def _most_rows(column: h5py.Dataset, most: int) -> int:
-    """Number of rows, counted from the first row, that can be read; at most `most`. Found by bisection: if the first n
-    rows can be read, the first n - 1 can be read, too.
+def _most_rows(column: h5py.Dataset, largest: int) -> int:
+    """Number of rows, counted from the first row, that can be read; at most `largest`. Found by bisection: if the first
+    n rows can be read, the first n - 1 can be read, too.
     """
-    least, most = 0, min(most, len(column))
-    while least < most:
-        half = (least + most + 1) // 2
+    smallest, largest = 0, min(largest, len(column))
+    while smallest < largest:
+        half = (smallest + largest + 1) // 2
         try:
             column[:half]
-            least = half
+            smallest = half
         except hdf5.ALTERED:
-            most = half - 1
-    return least
+            largest = half - 1
+    return smallest

@@ -152,7 +152,7 @@ def _from_folder(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, f
     # if there is a z-1 as well as a z1, the mark is a sign and not a hyphen
     if len({re.sub(r"\d+", "#", name) for name in files}) > 1:
         files.sort(key=lambda name: [int(number) for number in re.findall(r"-?\d+", name)])
-    files = files if len(files) > 1 else [name for some in series.values() for name in some]
+    files = files if len(files) > 1 else [name for names_of_series in series.values() for name in names_of_series]
     if not files:
         inside = [path / name for name in (RECON, "volume.h5") if (path / name).is_file()]
         raise DataError(
@@ -163,7 +163,11 @@ def _from_folder(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, f
                 else f"; a volume must be such a folder, a Zarr, or {', '.join(SUFFIXES)}."
             )
         )
-    if others := [f"{len(some)} of {name}" for name, some in series.items() if len(some) > 1 and some is not files]:
+    if others := [
+        f"{len(names_of_series)} of {name}"
+        for name, names_of_series in series.items()
+        if len(names_of_series) > 1 and names_of_series is not files
+    ]:
         example = files[0]
         raise DataError(
             f"Put each volume into a folder of its own: {path} contains several series of images: {len(files)} such "

@@ -80,7 +80,7 @@ def run_batch(scans: Sequence[Path], recipe: Path | None, folder: Path, sink: Si
         KeyboardInterrupt: Ctrl-C was pressed. The table lists the scans that are done.
     """
     _begin(folder, b"" if recipe is None else recipe.read_bytes())
-    how = [] if recipe is None else ["--config", str(folder / RECIPE)]
+    recipe_options = [] if recipe is None else ["--config", str(folder / RECIPE)]
     try:
         lock = WriterLock(folder / RECIPE, exclusive=True)
     except (BlockingIOError, PermissionError) as error:
@@ -94,7 +94,7 @@ def run_batch(scans: Sequence[Path], recipe: Path | None, folder: Path, sink: Si
         _write(folder, rows)
         waiting = [n for n, row in enumerate(rows) if not row.has_volume]
         for n in in_turn("batch", waiting, lambda n: rows[n].scan, sink, clock):
-            row = rows[n] = _reconstruct_row(rows[n], folder / rows[n].name, how, sink, clock)
+            row = rows[n] = _reconstruct_row(rows[n], folder / rows[n].name, recipe_options, sink, clock)
             _write(folder, rows)
             state = row.state + (f" with {count(row.warnings, 'warning')}" if row.warnings else "")
             sentence = f"{row.name}: {state}, {row.seconds:.0f} s{', ' + row.message if row.message else ''}"
@@ -317,8 +317,10 @@ def batch(scans: list[Path], config: Path | None, output: Path, as_json: bool) -
         warned = sum(row.has_volume and row.warnings > 0 for row in rows)
         counts = {"done": len(rows) - len(failed), "warned": warned, "failed": len(failed), "output": output / TABLE}
         with_warnings = f", {warned} with warnings" if warned else ""
-        every = [] if failed else [f"{len(rows)} of {len(rows)} scans have a volume{with_warnings}: {output / TABLE}"]
-        answer.done(counts, *every)
+        finished_lines = (
+            [] if failed else [f"{len(rows)} of {len(rows)} scans have a volume{with_warnings}: {output / TABLE}"]
+        )
+        answer.done(counts, *finished_lines)
     if failed:
         table_file = output / TABLE
         raise DataError(f"{len(failed)} of {len(rows)} scans failed; {table_file} says why.")

@@ -67,16 +67,16 @@ class RunServer:
             initial = _posted(each.default, self._run.stamped.stamp(each.name))
             self._shown[each.name] = pv = SharedPV(nt=kind, initial={**initial, **about})
             provider.add(prefix + each.metadata["name"], pv)
-        begun = Stamp(now())
-        self._heartbeat = SharedPV(nt=NTScalar("l"), initial=_posted(0, begun))
+        started = Stamp(now())
+        self._heartbeat = SharedPV(nt=NTScalar("l"), initial=_posted(0, started))
         provider.add(prefix + "Heartbeat", self._heartbeat)
-        untold = _posted(False, begun)
+        untold = _posted(False, started)
         self._verbs = {verb: SharedPV(nt=NTScalar("?"), initial=untold) for verb in (Verb if control else ())}
         for verb, pv in self._verbs.items():
             pv.put(self._verb(verb))
             provider.add(f"{prefix}{verb.value.capitalize()}Scan", pv)
         # kept in a list, because a PV without a reference loses its handler
-        self._decide = SharedPV(nt=NTScalar("s"), initial=_posted("", begun))
+        self._decide = SharedPV(nt=NTScalar("s"), initial=_posted("", started))
         self._decide.put(self._take_answer)
         if control:
             provider.add(prefix + "Decide", self._decide)

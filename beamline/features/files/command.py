@@ -101,11 +101,11 @@ def _described(facts: Mapping[str, Any]) -> list[str]:
     """The facts about a scan or a volume as lines."""
     from beamline.storage.flag_legend import counted
 
-    apart = ("attributes", "not_used", "findings")
-    shown = {name: value for name, value in facts.items() if name not in apart}
+    listed_separately = ("attributes", "not_used", "findings")
+    shown = {name: value for name, value in facts.items() if name not in listed_separately}
     if shown.get("flags") is not None:
         shown["flags"] = counted(shown["flags"])
-    for name in apart[:2]:
+    for name in listed_separately[:2]:
         shown |= facts.get(name, {})
     width = max(map(len, shown)) + 2
     lines = [f"{name:<{width}}{_text(value)}" for name, value in shown.items()]
@@ -132,10 +132,10 @@ def _print_statistics(
             write_whole(output, histograms(statistics))
         facts = {kind: dict(zip(rows[0][1:], figures, strict=True)) for kind, *figures in rows[1:]}
         lines = [aligned(rows, ">"), *(f"light   {line}" for line in dose)]
-        beyond = (
+        missing_text = (
             f"! Not included above: pixels without data (not finite, or above {LARGEST:g}, which no detector counts)."
         )
-        lines += [beyond] * any(each.not_finite for each in statistics)
+        lines += [missing_text] * any(each.not_finite for each in statistics)
         lines += [] if output is None else [f"output  {output}"]
         answer.done({**facts, "light": dose, "output": output}, *lines)
 

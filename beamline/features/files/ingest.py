@@ -101,10 +101,10 @@ def _refuse_what_a_copy_would_not_state(source: ScanSource) -> None:
     """Raise DataError for a scan with unknown angles, displaced projections, altered rows or oblong pixels, which the
     copy could not store."""
     n = source.table.views.size
-    if unknown := n - source.table.views_with_angles.size:
+    if n_unknown := n - source.table.views_with_angles.size:
         raise DataError(
-            f"{source.path} does not state the angles of {unknown} of its {n} projections. Add --angles FILE (degrees, "
-            "one a line). Nothing was written."
+            f"{source.path} does not state the angles of {n_unknown} of its {n} projections. Add --angles FILE "
+            "(degrees, one a line). Nothing was written."
         )
     if source.table.shifts is not None:
         raise DataError(

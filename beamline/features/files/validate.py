@@ -53,16 +53,16 @@ def volume_findings(record: ReconRecord) -> Iterator[Finding]:
             bad, first = bad + int((~finite).sum()), z if first is None else first
         if finite.any():
             low, high = min(low, float(values[finite].min())), max(high, float(values[finite].max()))
-    raw, there = record.raw_file, record.parameters.get("partial")
+    raw, stored_part = record.raw_file, record.parameters.get("partial")
     partial = (
-        f"The volume is partial: {there} are reconstructed, the other slices are empty. `beamline recon --resume` "
-        "reconstructs the empty slices."
+        f"The volume is partial: {stored_part} are reconstructed, the other slices are empty. `beamline recon "
+        "--resume` reconstructs the empty slices."
     )
     early = "The reconstruction was stopped early; the file contains the volume reached by then."
     rules = (
         (bad > 0, Finding("error", "voxels", f"{bad} voxels are NaN or infinite (first: slice {first}).")),
         (low == high, Finding("error", "voxels", f"Every voxel is {low:g}.")),
-        (bool(there), Finding("error", "partial", partial)),
+        (bool(stored_part), Finding("error", "partial", partial)),
         (record.ending.early, Finding("warning", "ended-early", early)),
         (
             record.length_unit != "mm",
@@ -146,7 +146,7 @@ def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator
         progress: function that gets the number of frames read and their total number; None: only frames that other
             rules have read are checked.
     """
-    n, unreadable, why = len(source.table), list[int](), ""
+    n, unreadable, reason = len(source.table), list[int](), ""
     if source.table.altered.any():
         yield Finding("error", "records", altered_sentence(source))
     for row in range(n) if progress is not None else ():
@@ -154,12 +154,12 @@ def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator
             source.read([row])
         except DataError as error:
             unreadable.append(row)
-            why = why or str(error)
+            reason = reason or str(error)
         if progress is not None:
             progress(row + 1, n)
     if unreadable:
         sentence = (
-            f"{count(len(unreadable), 'frame')} cannot be read: {spans(unreadable)}. {why} Use an intact copy "
+            f"{count(len(unreadable), 'frame')} cannot be read: {spans(unreadable)}. {reason} Use an intact copy "
             "of the file."
         )
         yield Finding("error", "unreadable", sentence)

@@ -173,9 +173,9 @@ class _Server:
 
     def facts(self, request: Request) -> Response:
         facts = self._reader.do(Recording.facts)
-        what = self._reader.what
-        path = str((what.folder or what.scan).resolve())
-        return JSONResponse({**facts, "run": what.name, "path": path, "may_act": self._access.act is not None})
+        watched_run = self._reader.what
+        path = str((watched_run.folder or watched_run.scan).resolve())
+        return JSONResponse({**facts, "run": watched_run.name, "path": path, "may_act": self._access.act is not None})
 
     async def feed(self, request: Request) -> Response:
         """Server-sent events: each event of the run with its number as id, `state` whenever the state changes, and

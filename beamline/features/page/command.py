@@ -75,13 +75,15 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
 
     folder = path or Path(RUNS)
     if path is not None and not path.exists():
-        there = ", ".join(run.name for run in runs_in(Path(RUNS))[:5])
-        held_runs = f"the newest runs in {RUNS} are {there}" if there else f"there are no runs in {RUNS}"
+        run_names = ", ".join(run.name for run in runs_in(Path(RUNS))[:5])
+        held_runs = f"the newest runs in {RUNS} are {run_names}" if run_names else f"there are no runs in {RUNS}"
         raise ConfigError(f"{path} does not exist; {held_runs}.")
-    what = watched(newest(folder) if path is None or (path.is_dir() and runs_in(path)) else folder)
-    if not (held(what.scan) if what.folder is None else alive(what.folder)) and (advice := next_step(what.scan)):
+    watched_run = watched(newest(folder) if path is None or (path.is_dir() and runs_in(path)) else folder)
+    if not (held(watched_run.scan) if watched_run.folder is None else alive(watched_run.folder)) and (
+        advice := next_step(watched_run.scan)
+    ):
         click.echo(advice, err=True)
-    reader = Reader(what)
+    reader = Reader(watched_run)
     try:
         reader.state()  # raises an error for a scan of another program, which the page cannot show
         server = start(lambda access: page(reader, access, say), open_port(bind, port), control=control)

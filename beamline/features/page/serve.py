@@ -263,9 +263,9 @@ class _Connection(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self.since = time.monotonic()
-        there: list[Any] = [each for each in self.connections if not each.transport.is_closing()]
-        idle = [each for each in there if each.cycle is None or each.cycle.response_complete]
-        if idle and len(there) > CONNECTIONS:
+        open_connections: list[Any] = [each for each in self.connections if not each.transport.is_closing()]
+        idle = [each for each in open_connections if each.cycle is None or each.cycle.response_complete]
+        if idle and len(open_connections) > CONNECTIONS:
             min(idle, key=attrgetter("known", "since")).transport.abort()
 
 

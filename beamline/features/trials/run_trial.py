@@ -123,8 +123,8 @@ def averaged(views: Views, choice: ViewChoice) -> Views:
     angles.setflags(write=False)
     lines = np.stack([math.log(choice.window) - logsumexp(-views.data[group], axis=0) for group in groups])
     weights = None if views.weights is None else np.stack([views.weights[group].min(axis=0) for group in groups])
-    apart = middle.seen
-    return replace(apart, data=lines, geometry=replace(apart.geometry, angles=angles), weights=weights)
+    used_views = middle.seen
+    return replace(used_views, data=lines, geometry=replace(used_views.geometry, angles=angles), weights=weights)
 
 
 def run_trial(

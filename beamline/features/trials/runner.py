@@ -102,9 +102,9 @@ def opened_scan(
     truth = None
     if truth_given is not None:
         truth = fit_truth(truth_given, Grid.matching(prepared.geometry), compared.selection.binning).data
-    by = HELD_OUT if truth is None else "psnr"
+    measure = HELD_OUT if truth is None else "psnr"
     facts["volume"] = " × ".join(map(str, Grid.matching(prepared.geometry).shape))
-    table = TrialTable(name, title, (), by, machine(), facts, compared.command)
+    table = TrialTable(name, title, (), measure, machine(), facts, compared.command)
     return TrialData(prepared.views, truth, seed=compared.seed), table
 
 

@@ -172,13 +172,13 @@ class SweptScan(TrialScan):
         projection."""
         used = self._used
         assert used is not None and self._views is not None
-        apart = used.unseen
-        assert apart is not None and apart.ids is not None
-        projector, data = Projector(apart.geometry, volume.grid), apart.data
-        data = data if apart.weights is None else np.where(apart.weights[...] > 0, data, np.float32(np.nan))
+        held_out = used.unseen
+        assert held_out is not None and held_out.ids is not None
+        projector, data = Projector(held_out.geometry, volume.grid), held_out.data
+        data = data if held_out.weights is None else np.where(held_out.weights[...] > 0, data, np.float32(np.nan))
         model = projector.forward(np.asarray(volume.data))
         unseen = UnseenViews(
-            apart.ids, projection_lines(data), projection_lines(model), projector.resolution, self._views[2]
+            held_out.ids, projection_lines(data), projection_lines(model), projector.resolution, self._views[2]
         )
         self.unseen[trial.label] = unseen
         squares = squares_left(unseen.model, unseen.data, None, unseen.resolution)

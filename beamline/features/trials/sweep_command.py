@@ -157,8 +157,8 @@ def sweep(words: tuple[str, ...], output: Path | None, as_json: bool) -> None:
     plan = partial(planned_sweep, trials, shlex.join(["beamline", "sweep", *words]))
     table = compare(plan, file, folder, as_json=as_json)
     if not as_json and table.best is not None:
-        again = [word for name, value in table.best.items() for word in _as_words(name, str(value))]
-        recon_command = shlex.join(["beamline", "recon", *common, *again])
+        option_words = [word for name, value in table.best.items() for word in _as_words(name, str(value))]
+        recon_command = shlex.join(["beamline", "recon", *common, *option_words])
         click.echo(
             f"If the pictures confirm the best value, use: {recon_command}",
             err=True,

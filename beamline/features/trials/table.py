@@ -147,20 +147,20 @@ def sentences(table: TrialTable) -> list[str]:
 
 def _conclusions(table: TrialTable) -> list[str]:
     """The trial that is best for its time, and the time that each further dB costs along the Pareto front."""
-    by, front = table.by, table.front
+    measure, front = table.by, table.front
     if not front:
         return ["No trial has both a time and a quality."]
     best = front[-1]
-    pick = next(outcome for outcome in front if outcome.quality(by) >= best.quality(by) - _ALIKE_DB)
-    out = [f"Best for its time: {pick.trial.label}: {pick.quality(by):.2f} dB in {_seconds(pick.seconds)} s."]
-    out += [f"Quality: {_QUALITY[by]}. Fastest: {front[0].trial.label}, {front[0].quality(by):.2f} dB."]
+    pick = next(outcome for outcome in front if outcome.quality(measure) >= best.quality(measure) - _ALIKE_DB)
+    out = [f"Best for its time: {pick.trial.label}: {pick.quality(measure):.2f} dB in {_seconds(pick.seconds)} s."]
+    out += [f"Quality: {_QUALITY[measure]}. Fastest: {front[0].trial.label}, {front[0].quality(measure):.2f} dB."]
     for before, after in pairwise(front):
-        rise, cost = after.quality(by) - before.quality(by), after.seconds - before.seconds
-        chance = f" ± {table.chance(after, before):.2f}" * (by == HELD_OUT)
+        rise, cost = after.quality(measure) - before.quality(measure), after.seconds - before.seconds
+        chance = f" ± {table.chance(after, before):.2f}" * (measure == HELD_OUT)
         price = f"{_seconds(cost)} s more ({_seconds(cost / rise)} s a dB)"
         out.append(f"+{rise:.2f}{chance} dB for {price}: {after.trial.label}.")
-    highest = max((o for o in table.compared if math.isfinite(o.quality(by))), key=lambda o: o.quality(by))
-    if (gain := highest.quality(by) - best.quality(by)) >= LEAST_GAIN:
+    highest = max((o for o in table.compared if math.isfinite(o.quality(measure))), key=lambda o: o.quality(measure))
+    if (gain := highest.quality(measure) - best.quality(measure)) >= LEAST_GAIN:
         chance = (
             f"+{gain:.2f} dB with {highest.trial.label}, but the difference may be chance (± "
             f"{table.chance(highest, best):.2f} dB)."

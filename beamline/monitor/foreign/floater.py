@@ -184,9 +184,9 @@ def _is_crumb(track: Track) -> bool:
 
 def _same(known: SeenCrumb, crumb: SeenCrumb) -> bool:
     """Whether a track continues the known track."""
-    apart = abs(known.col + known.speed * (crumb.time - known.time) - crumb.col)
+    distance = abs(known.col + known.speed * (crumb.time - known.time) - crumb.col)
     rows = known.top - 1 <= crumb.below and crumb.top - 1 <= known.below
-    return rows and apart <= NEAR + 0.2 * abs(known.speed * (crumb.time - known.time))
+    return rows and distance <= NEAR + 0.2 * abs(known.speed * (crumb.time - known.time))
 
 
 def _rows(track: Track) -> tuple[int, int]:

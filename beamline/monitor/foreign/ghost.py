@@ -248,8 +248,8 @@ def _designed(rim: float, stride: int, noise: float, limit: float) -> Filters:
             for sign in (-1.0, 1.0):
                 speed = sign * COLUMNS * (1 + 2 * width) / crossing
                 if abs(speed) > FASTER * rim:
-                    away = np.clip((cols - speed * stride * views) / (width * COLUMNS), -1, 1)
-                    signals.append(np.cos(0.5 * np.pi * away) ** 2)
+                    position = np.clip((cols - speed * stride * views) / (width * COLUMNS), -1, 1)
+                    signals.append(np.cos(0.5 * np.pi * position) ** 2)
                     speeds.append(speed)
     clutter = Clutter(MARGIN * rim * stride, STRUCTURE, COMMON, noise**2)
     all_filters = filters(LAGS, clutter, np.array(signals).reshape(len(speeds), views.size), np.array(speeds))
@@ -264,7 +264,7 @@ def best_trail(peaks: Sequence[Peak], turn: float) -> Trail | None:
     A point of the sample at the distance x from the middle moves by less than turn sqrt(radius² - x²) per projection.
     `turn` is in radians per projection; x and the radius (half the field of view) are in broad columns.
     """
-    best, most, last = None, 0.0, peaks[-1]
+    best, best_total, last = None, 0.0, peaks[-1]
     alike = [peak for peak in peaks if peak.score * last.score > 0]
     for first in alike:
         age = last.view - first.view
@@ -275,6 +275,6 @@ def best_trail(peaks: Sequence[Peak], turn: float) -> Trail | None:
             continue
         since = [peak for peak in alike if peak.view >= first.view]
         near = [abs(p.score) for p in since if abs(p.col - (last.col - speed * (last.view - p.view))) <= OFF]
-        if len(near) >= max(LEAST, SHARE * (age + 1)) and (total := sum(near)) > most:
-            best, most = Trail(first.view, speed), total
+        if len(near) >= max(LEAST, SHARE * (age + 1)) and (total := sum(near)) > best_total:
+            best, best_total = Trail(first.view, speed), total
     return best

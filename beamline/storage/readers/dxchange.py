@@ -117,10 +117,10 @@ class ExchangeSource(StacksSource):
         if not self.grows:
             return super().refresh()
         ended, theta = self.finished, datasets.dataset(self._file, "exchange/theta") if self.own_angles else None
-        there = [hdf5.n_written(stack.frames) for stack in self._stacks]
-        angled = hdf5.n_written(theta) if theta is not None else there[-1]
-        there[-1] = min(there[-1], angled)
-        self.number_frames([len(stack.frames) for stack in self._stacks] if ended else there)
+        n_written = [hdf5.n_written(stack.frames) for stack in self._stacks]
+        angled = hdf5.n_written(theta) if theta is not None else n_written[-1]
+        n_written[-1] = min(n_written[-1], angled)
+        self.number_frames([len(stack.frames) for stack in self._stacks] if ended else n_written)
         views = self.table.views
         if self.own_angles:
             self.table.angles[views] = _theta(self._file, views.size, ended)[: views.size]
@@ -193,9 +193,9 @@ def _set_exposures(table: FrameTable, file: h5py.File) -> None:
         return
     table.exposures[:] = seconds[0] if seconds.size == 1 else np.nan
     table.exposures[table.views] = seconds
-    how = datasets.dataset(file, f"{_FLATS}/different_flat_exposure")
+    differs = datasets.dataset(file, f"{_FLATS}/different_flat_exposure")
     of_flats = _seconds(file, f"{_FLATS}/flat_exposure_time", 1)
-    if of_flats is not None and how is not None and _words(how).lower().startswith("different"):
+    if of_flats is not None and differs is not None and _words(differs).lower().startswith("different"):
         table.exposures[table.flats] = of_flats
 
 

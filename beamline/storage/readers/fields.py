@@ -66,17 +66,17 @@ def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
         if item.size * item.dtype.itemsize > datasets.BRIEF:
             unused.append(NotUsed(field.where, f"{' x '.join(map(str, item.shape))} values", "it is too large", False))
             continue
-        value, why, doubt, share = np.asarray(datasets.values_of(item)), field.use, True, 0.0
+        value, reason, doubt, share = np.asarray(datasets.values_of(item)), field.use, True, 0.0
         if not field.used:
             doubt = field.matters is not None and field.matters(value, item, source)
         elif value.size not in (1, frames, views.size):
-            why = f"the field has {value.size} values, but the scan has {frames} frames"
+            reason = f"the field has {value.size} values, but the scan has {frames} frames"
         else:
             varying, share = _varying(field, item, source)
-            why = _unit_problem(field, value, item, source) or varying
-        if why:
+            reason = _unit_problem(field, value, item, source) or varying
+        if reason:
             text = _text(value, datasets.attribute(item, "units"))
-            unused.append(NotUsed(field.where, text, why, doubt, share > _WRONG))
+            unused.append(NotUsed(field.where, text, reason, doubt, share > _WRONG))
     return tuple(unused)
 
 

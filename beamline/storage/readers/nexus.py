@@ -223,10 +223,10 @@ def read_geometry(places: Places) -> NexusGeometry:
         sod, sdd = cone
         pixels = [theirs * sdd / sod if theirs else ours for theirs, ours in zip(at_sample, own, strict=True)]
     mirrored, turned = _mirrored(detector)
-    if how := [name for name, is_so in zip(("upside down", "left to right"), mirrored, strict=True) if is_so]:
-        remarks["flipped"] = f"{' and '.join(how)}: frames are mirrored back when they are read"
-    beside = [own[0] or pixels[0], own[1] or pixels[1] or own[0]]
-    row, col = (_central(places, i, beside[i], mirrored[1 - i]) for i in (1, 0))
+    if mirrored_text := [name for name, is_so in zip(("upside down", "left to right"), mirrored, strict=True) if is_so]:
+        remarks["flipped"] = f"{' and '.join(mirrored_text)}: frames are mirrored back when they are read"
+    pixel_sizes = [own[0] or pixels[0], own[1] or pixels[1] or own[0]]
+    row, col = (_central(places, i, pixel_sizes[i], mirrored[1 - i]) for i in (1, 0))
     return NexusGeometry((pixels[0], pixels[1]), cone, (row, col), mirrored, turned, remarks)
 
 
@@ -246,18 +246,16 @@ def _cone_of(
     """The value `cone` of `NexusGeometry`, and a remark if the beam is practically parallel. Widths of pixels are in
     mm.
     """
-    upstream, beyond = (
-        _source_distance(places.entry),
-        datasets.scalar(places.detector, "distance", datasets.LENGTH_UNITS),
-    )
-    if upstream is None or beyond is None:
+    upstream = _source_distance(places.entry)
+    detector_distance = datasets.scalar(places.detector, "distance", datasets.LENGTH_UNITS)
+    if upstream is None or detector_distance is None:
         return None, {}
-    sod, sdd = abs(upstream), abs(upstream) + beyond
-    if not (sod > 0 and beyond >= 0):
+    sod, sdd = abs(upstream), abs(upstream) + detector_distance
+    if not (sod > 0 and detector_distance >= 0):
         raise DataError(
             f"{places.entry.file.filename}: the source is {upstream:g} mm from the sample and the detector "
-            f"{beyond:g} mm behind it; expected a source distance other than 0 and a detector distance of 0 or more. "
-            "Correct the distances in a copy of the file."
+            f"{detector_distance:g} mm behind it; expected a source distance other than 0 and a detector distance of 0 "
+            "or more. Correct the distances in a copy of the file."
         )
     width, cols = at_sample or (None if own is None else own * sod / sdd), places.data.shape[2]
     diverged = None if width is None else width * cols / 2 / sod * cols / 2

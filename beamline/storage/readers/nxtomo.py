@@ -115,8 +115,8 @@ class NexusSource(ScanSource):
         places, keys, ended = self._places, self._places.keys, self.finished
         hdf5.look_again(keys)
         angle = places.angle if self._own_angles else None
-        there = [hdf5.n_written(each) for each in (places.data, angle) if each is not None]
-        n = len(places.data) if ended else min(*there, len(keys))
+        n_written = [hdf5.n_written(each) for each in (places.data, angle) if each is not None]
+        n = len(places.data) if ended else min(*n_written, len(keys))
         angles = np.full(n, np.nan) if angle is None else places.sense * datasets.radians(angle) + 0.0  # avoids -0
         kinds = kinds_of(np.ravel(datasets.values_of(keys)))
         sizes = (int(places.data.shape[0]), kinds.size, angles.size)
@@ -174,8 +174,8 @@ class NexusSource(ScanSource):
         self.not_used += stated_in(NXTOMO, self._places.entry, self, str(self._places.detector.name))
         for other in {str(each.data.name): each for each in detectors if each.data != self._places.data}.values():
             shape, where = " x ".join(map(str, other.data.shape)), str(other.data.name)
-            why = f"these frames belong to another scan in the file; --data-path {where} selects this scan"
-            self.not_used += (NotUsed(where, f"{shape} frames", why, True),)
+            reason = f"these frames belong to another scan in the file; --data-path {where} selects this scan"
+            self.not_used += (NotUsed(where, f"{shape} frames", reason, True),)
         if turned:
             self.not_used += (NotUsed("detector/transformations", turned, UPRIGHT, True),)
 

@@ -258,8 +258,8 @@ def _true_type(source: ScanSource) -> np.dtype[Any] | None:
     type can represent all frames. None: the stored type is right.
     """
     if source.dtype.kind == "u":
-        some = [each for each in _some_of_each_kind(source) if each.any()]
-        types = {real_type(each) for each in some}
+        shown_images = [each for each in _some_of_each_kind(source) if each.any()]
+        types = {real_type(each) for each in shown_images}
         return types.pop() if len(types) == 1 else None
     looked_at = [(images, type_wrapped(images)) for images in _some_of_each_kind(source)]
     dtype = max((each for _, each in looked_at if each is not None), key=lambda each: each.itemsize, default=None)
@@ -269,11 +269,11 @@ def _true_type(source: ScanSource) -> np.dtype[Any] | None:
 
 def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
     for kind in (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK):
-        some = examined(source, kind)
-        if some.size:
-            every = max(1, source.shape[0] * source.shape[1] // _PIXELS, source.frame_bytes // UNPACKED)
+        images = examined(source, kind)
+        if images.size:
+            stride = max(1, source.shape[0] * source.shape[1] // _PIXELS, source.frame_bytes // UNPACKED)
             with suppress(DataError):  # an unreadable frame is reported where it is used
-                yield read_known(source, some[:1] if every > 1 else some, slice(None, None, every))
+                yield read_known(source, images[:1] if stride > 1 else images, slice(None, None, stride))
 
 
 def _refuse(options: SourceOptions, follow: bool) -> None:

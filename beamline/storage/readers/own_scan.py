@@ -68,15 +68,15 @@ class OwnScan(ScanSource):
 
     def _cone(self) -> tuple[float, float] | None:
         places = layout.SOURCE_DISTANCE, f"{layout.DETECTOR}/distance"
-        sod, beyond = (datasets.scalar(self._scan.file, each, datasets.LENGTH_UNITS) for each in places)
-        if sod is None or beyond is None:
+        sod, detector_distance = (datasets.scalar(self._scan.file, each, datasets.LENGTH_UNITS) for each in places)
+        if sod is None or detector_distance is None:
             return None
-        if sod <= 0 or beyond < 0:
+        if sod <= 0 or detector_distance < 0:
             raise DataError(
-                f"{self.path}: the source is {sod:g} mm in front of the sample and the detector {beyond:g} mm behind "
-                "it; expected a source distance above 0. Correct the distances in a copy of the file."
+                f"{self.path}: the source is {sod:g} mm in front of the sample and the detector {detector_distance:g} "
+                "mm behind it; expected a source distance above 0. Correct the distances in a copy of the file."
             )
-        return sod, sod + beyond
+        return sod, sod + detector_distance
 
     @hdf5.guarded
     def refresh(self) -> int:

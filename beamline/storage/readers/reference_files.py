@@ -57,12 +57,12 @@ def stated_references(
         DataError: the values of the pixels cannot be transmission.
     """
     darks, flats = given
-    nothing = np.zeros((1, *base.shape), base.dtype)
+    empty_frame = np.zeros((1, *base.shape), base.dtype)
     if quantity != "transmission":
         if white is None or base.dtype.kind not in "ui":
             return given
-        flats = np.full_like(nothing, white) if flats is None else flats
-        return nothing if darks is None else darks, flats
+        flats = np.full_like(empty_frame, white) if flats is None else flats
+        return empty_frame if darks is None else darks, flats
     if darks is not None or flats is not None:
         raise DataError(
             "Omit --darks and --flats, because --quantity transmission means that the frames were "
@@ -74,7 +74,7 @@ def stated_references(
             "as 65535, or the counts of air next to the sample, represents a transmission of 1, leave out "
             "--quantity and give this integer as flat: --flats 65535 --darks 0."
         )
-    return nothing, np.ones_like(nothing)
+    return empty_frame, np.ones_like(empty_frame)
 
 
 _EXCHANGE = {FrameKind.DARK: "exchange/data_dark", FrameKind.FLAT: "exchange/data_white"}

@@ -157,8 +157,8 @@ def read_side_file(path: Path) -> SideFile:
     try:
         values = _values(path)
     except (OSError, ValueError, configparser.Error, ElementTree.ParseError, RecursionError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise DataError(f"{path} cannot be read as a settings file of a CT scanner ({why}).") from error
+        reason = getattr(error, "strerror", None) or error
+        raise DataError(f"{path} cannot be read as a settings file of a CT scanner ({reason}).") from error
     for keys in MAKERS:
         if keys.suffix == path.suffix.lower() and keys.sod in values:
             return _side_file(path, keys, values)

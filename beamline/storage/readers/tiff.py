@@ -108,7 +108,7 @@ def stated(path: Path, tif: tifffile.TiffFile) -> tuple[NotUsed, ...]:
     Raises:
         DataError: the OME metadata state several axes, and it is unclear which of them counts the projections.
     """
-    listed, why = 0, "the full-resolution images of this file are used as frames"
+    listed, reason = 0, "the full-resolution images of this file are used as frames"
     for pixels in re.findall(r"<Pixels\b[^>]*>", tif.pages.first.description):
         sizes = {axis: int(n) for axis, n in re.findall(r'\bSize([CZT])="(\d+)"', pixels) if int(n) > 1}
         listed += math.prod(sizes.values())
@@ -120,7 +120,7 @@ def stated(path: Path, tif: tifffile.TiffFile) -> tuple[NotUsed, ...]:
     notes = [("pages of other resolutions or masks", copies, False)] if copies else []
     if path.suffix.lower() in SUFFIXES and listed > len(tif.pages):
         notes += [(OTHER_FILES, listed - len(tif.pages), True)]
-    return tuple(NotUsed(where, str(n), why, doubt) for where, n, doubt in notes)
+    return tuple(NotUsed(where, str(n), reason, doubt) for where, n, doubt in notes)
 
 
 def read_image(file: Path | IO[bytes], most: float = math.inf) -> NDArray[Any]:

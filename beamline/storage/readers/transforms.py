@@ -335,12 +335,12 @@ def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any]
     if flat is not None:
         flat = flat - np.iinfo(dtype).min
         lit = flat >= whole - whole // _END_PART
-        beside = np.maximum(np.minimum(change[..., :-2], change[..., 2:]), 1)
-        steps &= ~(lit[..., 1:-2] & lit[..., 2:-1]) | (whole - change[..., 1:-1] <= _SMOOTH * beside)
+        neighbour_change = np.maximum(np.minimum(change[..., :-2], change[..., 2:]), 1)
+        steps &= ~(lit[..., 1:-2] & lit[..., 2:-1]) | (whole - change[..., 1:-1] <= _SMOOTH * neighbour_change)
     edges = int(steps.sum())
     of_low, of_high = (np.where(side, change[..., 2:], change[..., :-2])[steps] for side in (above, ~above))
-    most = np.unique(counts[top], return_counts=True)[1].max(initial=0)
-    if edges < _A_ROW * np.prod(images.shape[:-1]) or most > 0.9 * top.sum():
+    most_equal = np.unique(counts[top], return_counts=True)[1].max(initial=0)
+    if edges < _A_ROW * np.prod(images.shape[:-1]) or most_equal > 0.9 * top.sum():
         return 0
     return 0 if np.median(of_low) < _ALIKE * np.median(of_high) else edges
 

@@ -28,14 +28,14 @@ _MANY = 30  # number of projections: a smaller scan within 6.28 degrees may be a
 def angles_unknown(scan: ScanEvidence) -> str:
     """Every projection has a finite angle; otherwise the finding names the projections without one."""
     unknown = np.setdiff1d(views := scan.table.views, scan.table.views_with_angles)
-    why = f"; {why}" if (why := scan.source.attributes.get("angles")) else ""
+    reason = f"; {reason}" if (reason := scan.source.attributes.get("angles")) else ""
     runs = np.split(unknown, np.flatnonzero(np.diff(unknown) > 1) + 1)
     listed = "+".join(f"{run[0]}:{run[-1] + 1}" for run in runs[:_LISTED] if run.size) + "+..." * (len(runs) > _LISTED)
     if not unknown.size:
         return ""
     first_frame = unknown[0]
     return (
-        f"{unknown.size} of {views.size} projections have no angle (first: frame {first_frame}){why}. Give the "
+        f"{unknown.size} of {views.size} projections have no angle (first: frame {first_frame}){reason}. Give the "
         "angles with --angles FILE (degrees, one per "
         f"line){f', or leave these projections out: --frames none={listed}' * (unknown.size < views.size)}."
     )

@@ -117,8 +117,16 @@ class CoarseViews:
             curve = mirror_mismatch(first, second, (cols - 1 + np.arange(-reach, reach + 1)) / 2)
             lowest = int(np.argmin(curve))
             if 0 < lowest < 2 * reach:
-                below, here, above = curve[lowest - 1 : lowest + 2]
-                return max(float(here - (below - above) ** 2 / 8 / max(below - 2 * here + above, 1e-12)), 0.0)
+                mismatch_below, mismatch_lowest, mismatch_above = curve[lowest - 1 : lowest + 2]
+                return max(
+                    float(
+                        mismatch_lowest
+                        - (mismatch_below - mismatch_above) ** 2
+                        / 8
+                        / max(mismatch_below - 2 * mismatch_lowest + mismatch_above, 1e-12)
+                    ),
+                    0.0,
+                )
         return float(curve.min())
 
     def mismatches(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:

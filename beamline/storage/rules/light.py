@@ -114,8 +114,8 @@ def check_air_level(scan: ScanEvidence, level: float, air: bool, accepted: bool 
     """
     darker = level > WARN and air
     if darker or level < -BRIGHTER:
-        where = "The air next to the sample" if air else "The least absorbing place in the projections"
-        what = (
+        place_text = "The air next to the sample" if air else "The least absorbing place in the projections"
+        use_text = (
             "this difference is subtracted as a change of the beam"
             if air
             else "this difference is not subtracted, because it is not known which pixels next to the sample show air"
@@ -123,8 +123,8 @@ def check_air_level(scan: ScanEvidence, level: float, air: bool, accepted: bool 
         factor = math.exp(abs(level))
         dark_or_bright = "dark" if level > 0 else "bright"
         sentence = (
-            f"{where} is {factor:.3g} times as {dark_or_bright} as the flats ({level:+.2f} in line integral, "
-            f"{what}). During one scan a beam changes by a factor of up to {math.exp(WARN):.2g}, and a sample can "
+            f"{place_text} is {factor:.3g} times as {dark_or_bright} as the flats ({level:+.2f} in line integral, "
+            f"{use_text}). During one scan a beam changes by a factor of up to {math.exp(WARN):.2g}, and a sample can "
             "only absorb. Were the projections, flats and darks taken with the same settings and stored in the same "
             f"way? {_counts_in_words(scan)}"
         )
@@ -193,8 +193,8 @@ def _counts_in_words(scan: ScanEvidence) -> str:
     counts = float(np.median(flat[brightest])), float(np.median(view[brightest]))
     flat_counts = counts[0]
     view_counts = counts[1]
-    there = f"Counts in these places: {flat_counts:.6g} in the flats, {view_counts:.6g} in the projections."
-    return f"{there} {_exposures_in_words(scan, flats, views)}"
+    counts_text = f"Counts in these places: {flat_counts:.6g} in the flats, {view_counts:.6g} in the projections."
+    return f"{counts_text} {_exposures_in_words(scan, flats, views)}"
 
 
 def _exposures_in_words(scan: ScanEvidence, *rows: NDArray[np.int64]) -> str:

@@ -45,9 +45,9 @@ def numbers_wrapped(scan: ScanEvidence) -> Iterator[Finding]:
     edges = sum(wrapped_edges(images, scan.source.dtype, flat) for images in frames)
     if not edges and low <= _FEW * sum(images.size for images in frames):
         return
-    least, most = np.iinfo(scan.source.dtype).min, np.iinfo(scan.source.dtype).max
-    what = (
-        f"{edges} pixels with values near {most} are next to pixels with values near {least}"
+    lowest, highest = np.iinfo(scan.source.dtype).min, np.iinfo(scan.source.dtype).max
+    finding = (
+        f"{edges} pixels with values near {highest} are next to pixels with values near {lowest}"
         if edges
         else f"{low} pixels are below {below:.0f}"
     )
@@ -56,9 +56,9 @@ def numbers_wrapped(scan: ScanEvidence) -> Iterator[Finding]:
         "error",
         WRAPPED,
         "Convert the frames of the camera again, to 32-bit integers or to floats: the 16-bit integers "
-        f"overflowed. In {n_frames} frames checked, {what}. Two things cause this. A sum of pixels or "
-        f"frames went above {most} and wrapped to {least}. Or a dark was subtracted and the result went below "
-        f"{least}. The true values of these pixels are lost, and other "
+        f"overflowed. In {n_frames} frames checked, {finding}. Two things cause this. A sum of pixels or "
+        f"frames went above {highest} and wrapped to {lowest}. Or a dark was subtracted and the result went below "
+        f"{lowest}. The true values of these pixels are lost, and other "
         "flats or darks do not help.",
     )
 

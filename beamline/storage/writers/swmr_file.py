@@ -51,10 +51,12 @@ def _new_file(path: Path) -> h5py.File:
         with suppress(OSError):  # HDF5 created it and then failed; a file that existed before raises FileExistsError
             path.unlink()
         if lock_failure(error) is LockFailure.NO_LOCKS:
-            why = no_locks_sentence(path.parent, error.errno)
-            raise DataError(f"{path} cannot be created: {why}. No part of the file was left on the disk.") from error
-        why = hdf5.reason(error)
-        raise DataError(f"{path} cannot be created ({why}). Check that its folder exists and is writable.") from error
+            reason = no_locks_sentence(path.parent, error.errno)
+            raise DataError(f"{path} cannot be created: {reason}. No part of the file was left on the disk.") from error
+        reason = hdf5.reason(error)
+        raise DataError(
+            f"{path} cannot be created ({reason}). Check that its folder exists and is writable."
+        ) from error
 
 
 class SwmrFile:

@@ -138,8 +138,8 @@ def _read(chosen: list[re.Match[str]]) -> tuple[NDArray[np.float64], str]:
         if _separates(chosen, before, zero=0 in degrees):
             minus[:] = False
         elif (mark := _mark(chosen[0])) in "mn-\u2013":
-            what = mark if mark in "mn" else "hyphen"
-            return degrees, f"the {what} before the number may be a minus sign or a separator"
+            character = mark if mark in "mn" else "hyphen"
+            return degrees, f"the {character} before the number may be a minus sign or a separator"
     if doubt := _doubt_of_decimals(chosen, before):
         return degrees, doubt
     if len({re.sub(r"\d+", "", text) for text in before}) > 1:
@@ -169,8 +169,8 @@ def _doubt_of_decimals(chosen: list[re.Match[str]], before: list[str]) -> str:
     if are_a_count(parts) or (are_a_count(wholes) and len({*parts}) > 1):
         return "the digits before or after the decimal mark only count the images"
     following = [_FOLLOWING.match(each.string[each.end() :]) for each in chosen]
-    for beside in (following, [_PRECEDING.search(text) for text in before]):
-        halves = np.sort([int(each[1]) for each in beside if each])
+    for matches in (following, [_PRECEDING.search(text) for text in before]):
+        halves = np.sort([int(each[1]) for each in matches if each])
         if not any(parts) and halves.size == len(chosen) and np.ptp(halves) and not _in_even_steps(halves):
             return (
                 "the number next to each angle does not count the images. Are the two numbers the integer part and "

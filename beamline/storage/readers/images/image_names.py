@@ -51,7 +51,7 @@ def kinds_of(path: object, names: Sequence[str]) -> dict[str, FrameKind]:
         series.setdefault(re.sub(r"\d+", "", short), []).append(name)
     sample = _sample_of(series, kinds)
     if sample is None:
-        numbers = ", ".join(f"{len(some)} of {key!r}" for key, some in [*series.items()][:6])
+        numbers = ", ".join(f"{len(names_of_series)} of {key!r}" for key, names_of_series in [*series.items()][:6])
         raise DataError(
             f"{path} contains no projections, because all images are named as darks or flats ({numbers}). If the "
             "sample itself has a name like dark or flat, give only the folder of its projections, and the other "
@@ -69,7 +69,7 @@ def _sample_of(series: dict[str, list[str]], kinds: dict[str, FrameKind]) -> str
     if len(named) == 1:
         return named[0]
     largest = max(series, key=lambda key: len(series[key]))
-    others = [name for key, some in series.items() if key != largest for name in some]
+    others = [name for key, names_of_series in series.items() if key != largest for name in names_of_series]
     both = {kinds[name] for name in others} >= {FrameKind.DARK, FrameKind.FLAT}
     return largest if both and len(series[largest]) > len(others) else None
 
@@ -189,8 +189,8 @@ def _places(path: object, stated: NamedAngles, images: Sequence[str], *, one_ser
     counted, several = _numbers(plain), len({_template(name, stated.doubt) for name in plain}) > 1
     if counted is not None and several and one_series and np.unique(counted).size < counted.size:
         within = _without_common_folder(plain)
-        apart = sorted(range(len(plain)), key=lambda i: (_rank(within[i]), _template(plain[i]), counted[i]))
-        return np.argsort(apart)
+        sorted_numbers = sorted(range(len(plain)), key=lambda i: (_rank(within[i]), _template(plain[i]), counted[i]))
+        return np.argsort(sorted_numbers)
     if counted is not None and (one_series or not several):
         return counted
     if len(plain) > 1 and (several or (stated.radians is None and not stated.doubt)):
@@ -259,7 +259,9 @@ def _frame_numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
 def places_of(names: Sequence[str]) -> str:
     """The rows that the images of each series have in the scan, such as "dark_#.tif 0:5, s_#.tif 5:95"."""
     of_names = groupby(range(len(names)), lambda place: re.sub(r"\d+", "#", names[place]))
-    runs = [f"{name} {places[0]}:{places[-1] + 1}" for name, some in of_names for places in [[*some]]]
+    runs = [
+        f"{name} {places[0]}:{places[-1] + 1}" for name, numbers_of_name in of_names for places in [[*numbers_of_name]]
+    ]
     return ", ".join(runs[:_LISTED]) + ", ..." * (len(runs) > _LISTED)
 
 

@@ -379,9 +379,9 @@ def _with_references_beside(source: TiffSeriesSource) -> TiffSeriesSource:
     with suppress(DataError, OSError):  # the folder above is only a suggestion, and may not contain a scan
         above = TiffSeriesSource(source.path.absolute().parent)
         views = [Path(above.names[i]).parts[0] for i in above.table.views]
-        beside = sorted({Path(name).parts[0] for name in above.names} - {*views})
-        if beside and {*views} == {source.path.absolute().name}:
-            above.facts = {**above.facts, "beside": ", ".join(beside)}
+        neighbour_folders = sorted({Path(name).parts[0] for name in above.names} - {*views})
+        if neighbour_folders and {*views} == {source.path.absolute().name}:
+            above.facts = {**above.facts, "beside": ", ".join(neighbour_folders)}
             return above
     return source
 

@@ -99,10 +99,10 @@ class TiffFolderVolume:
             raise DataError(
                 f"{path} cannot be read as a volume ({error}), because its files were changed after the export."
             ) from error
-        there = {item.name for item in path.iterdir()}
-        first = next((z for z in range(shape[0]) if _slice(path, z).name not in there), None)
+        names = {item.name for item in path.iterdir()}
+        first = next((z for z in range(shape[0]) if _slice(path, z).name not in names), None)
         if first is not None:
-            missing = shape[0] - sum(_slice(path, z).name in there for z in range(min(shape[0], first + len(there))))
+            missing = shape[0] - sum(_slice(path, z).name in names for z in range(min(shape[0], first + len(names))))
             n_slices = shape[0]
             raise DataError(
                 f"{missing} of {n_slices} slices are missing in {path} (first: {_slice(path, first).name})."
