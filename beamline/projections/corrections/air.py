@@ -237,9 +237,9 @@ def _described(fitted: Background, levelled: float) -> str:
     if abs(levelled) >= LEAST_SIZE:
         line_text = f"a line through the air at the edges was subtracted ({levelled:+.3f} in line integral); then "
     return (
-        f"{line_text}a polynomial of order {fitted.order} in column and row was fitted to the rays that miss the sample "
-        f"({fitted.air:.0%} of all rays). The polynomial is {fitted.lowest:+.3f} to {fitted.highest:+.3f} in line "
-        "integral"
+        f"{line_text}a polynomial of order {fitted.order} in column and row was fitted to the rays that miss the "
+        f"sample ({fitted.air:.0%} of all rays). The polynomial is {fitted.lowest:+.3f} to {fitted.highest:+.3f} in "
+        "line integral"
     )
 
 

@@ -146,11 +146,12 @@ def fit_series(
     The z_j are the orthonormal components of all volumes x_k; the first component is the common part of all volumes. If
     nothing moves, `fit_series` also tries another model: each volume is the mean volume, multiplied in each voxel by a
     factor that varies smoothly in space. `fit_series` returns the volumes of this model if they predict held-out
-    projections better than separate volumes do. Smooth factors suit a sample of particles in which each particle takes up or loses material at its
-    own time. Steps, memory, `go_on` and `stop` of `fit_series` are as in `fit_materials`. Up to four tests come before
-    the fit: they choose the weights, decide whether the sample moves, estimate the motion, and choose the smoothness of
-    the factors. During each test, and while the factors are fitted, the first argument of `go_on` counts the remaining
-    steps down to 0. If `go_on` ends the fit of the factors early, the result is the volumes without factors.
+    projections better than separate volumes do. Smooth factors suit a sample of particles in which each particle takes
+    up or loses material at its own time. Steps, memory, `go_on` and `stop` of `fit_series` are as in `fit_materials`.
+    Up to four tests come before the fit: they choose the weights, decide whether the sample moves, estimate the motion,
+    and choose the smoothness of the factors. During each test, and while the factors are fitted, the first argument of
+    `go_on` counts the remaining steps down to 0. If `go_on` ends the fit of the factors early, the result is the
+    volumes without factors.
 
     Use `motion=True` for a sample that settles. If only the densities of the sample change, `motion=True` finds motion
     that does not exist. For a sample that does not change, `tv_weight` has the same effect as the same weight for a

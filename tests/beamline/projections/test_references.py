@@ -100,9 +100,7 @@ def test_flats_darker_than_the_views_are_refused_where_the_exposures_are_known()
     found, warnings = prepare(source(dim, dim), SELECTION)
     assert found.geometry.n_views == 45
     assert any(
-        re.search(
-            r"times as bright as the flats.*Check whether flats and projections had the same exposure time", each
-        )
+        re.search(r"times as bright as the flats.*Check whether flats and projections had the same exposure time", each)
         for each in warnings
     )
     fine = source(exposure=0.05)

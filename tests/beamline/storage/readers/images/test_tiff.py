@@ -122,7 +122,9 @@ def test_a_gap_in_the_numbers_is_told_and_moves_no_angle(series: tuple[Path, np.
             assert source.attributes["missing_numbers"] == "5"
             np.testing.assert_allclose(source.table.angles[3:], np.radians(np.linspace(0, 165, 12))[there])
             np.testing.assert_array_equal(source.read(np.arange(3, 14)), images[there])
-    assert any("these numbers are missing in the names of the files: 5." in finding.message for finding in validate(folder))
+    assert any(
+        "these numbers are missing in the names of the files: 5." in finding.message for finding in validate(folder)
+    )
 
 
 def test_an_image_of_another_shape_or_a_broken_one_is_named(series: tuple[Path, np.ndarray]) -> None:
