@@ -72,6 +72,12 @@ chords = [r**2 - (cols - 127.5 - (x * np.cos(theta) + y * np.sin(theta))[:, None
           for x, y, z, r in places]
 projections = sum(0.02 * np.sqrt(np.maximum(each, 0)) for each in chords).astype(np.float32)
 """
+HASTY = """
+made, advance = recon.R2, recon.StreamingFit.advance
+recon.R2 = lambda seconds: made(seconds=seconds / 10)
+recon.StreamingFit.advance = lambda fit, seconds: advance(fit, seconds=seconds / 10)
+"""
+"""The times that the page gives to its fits, shorter: what holds at the end holds after a tenth of them."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +101,7 @@ class Script:
 
 SCRIPTS = {
     "library": Script(
-        "README.md", ("import numpy as np",), BALLS,
+        "README.md", ("import numpy as np",), BALLS + HASTY,
         "assert abs(axis.value - 127.5) < 0.1 and axis.confident, axis\n"
         "again = recon.Reconstruction.load('volume.npz')\n"
         "assert np.array_equal(again.volume.data, result.volume.data) and again.volume.grid == result.volume.grid\n"
