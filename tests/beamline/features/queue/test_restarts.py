@@ -94,8 +94,8 @@ def test_a_queue_that_was_killed_leaves_its_scan_alone(tmp_path: Path) -> None:
     time.sleep(3)  # for what the process may have left behind
     before = files(runs)
     assert [folder.name.rpartition("_")[2] for folder in runs.iterdir()] == ["one"]
-    done = subprocess.run([sys.executable, "-m", "beamline.cli.main", *queue(tmp_path, "three")], capture_output=True)
-    assert done.returncode == 0, done.stderr
+    done = CliRunner().invoke(main, [*queue(tmp_path, "three"), "--set", "simulation.clock=virtual"])
+    assert done.exit_code == 0, done.output
     after = files(runs)
     assert {path: after[path] for path in before} == before
     assert sorted(folder.name.rpartition("_")[2] for folder in runs.iterdir()) == ["one", "three"]
