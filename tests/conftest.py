@@ -86,14 +86,17 @@ _DURATIONS = Path(__file__).parent / "durations.json"
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark the tests of features (their folders mirror those of the features), and sort the longest files first.
 
-    With the longest files first, all workers end at about the same time.
+    With the longest files first, all workers end at about the same time. If slow tests run, their files come first:
+    a slow test at the end would leave the other workers idle.
     """
     for item in items:
         if _is_of_a_feature(item.path):
             item.add_marker("feature")
     if hasattr(config, "workerinput"):
         seconds = json.loads(_DURATIONS.read_text(encoding="utf-8"))
-        items.sort(key=lambda item: -seconds.get(item.nodeid.partition("::")[0], 0.0))
+        asked = "not slow" not in config.option.markexpr
+        slow = {item.path for item in items if asked and item.get_closest_marker("slow")}
+        items.sort(key=lambda item: (item.path not in slow, -seconds.get(item.nodeid.partition("::")[0], 0.0)))
 
 
 @pytest.fixture(scope="session", autouse=True)
