@@ -31,10 +31,10 @@ class Auto(Method):
     """Chooses a reconstruction method: `Auto` tests the candidates on a part of the scan, and takes the simplest
     candidate whose volume predicts the held-out projections about as well as that of the best candidate.
 
-    The tests use the sixteen rows with most material; in a cone beam, the sixteen rows in the middle. If these contain
-    little material, the tests use all rows at half the resolution. The test reconstructions hold out one of eight
-    projections, and need at least 16 projections; with fewer, `Auto` uses the last candidate. docs/choosing.md explains
-    this way to choose a method.
+    The tests use the sixteen rows with most material; in a cone beam, the sixteen rows in the middle. If the middle
+    rows contain little material, the tests use all rows at half the resolution. The test reconstructions hold out one
+    of eight projections, and need at least 16 projections; with fewer, `Auto` uses the last candidate. docs/choosing.md
+    explains this way to choose a method.
 
     Attributes:
         candidates: the methods, the simplest and cheapest first.
