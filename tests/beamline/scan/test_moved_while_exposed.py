@@ -172,7 +172,7 @@ def test_the_pairs_of_align_are_looked_at_too(times: int) -> None:
         used = nudged(instrument, touched, 8 + 2, times)  # the third view, after 4 darks and 4 flats
         asked = _blocks(0.1, [0.0, math.pi]), settings, used, StopRequest(), lambda event: None
         if times == 3:
-            with pytest.raises(InstrumentError, match="In 1 of"):
+            with pytest.raises(InstrumentError, match="For 1 of"):
                 take(*asked)
             return
         frames, _ = take(*asked)
