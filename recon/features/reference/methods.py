@@ -30,7 +30,7 @@ from recon.voxels.voxel_problem import Buffers, VoxelProblem, bytes_of, times_po
 
 _ROUNDS = PLAN[2:]
 # largest number of iterations of a round; rounds with falling weights, and iterations of each
-_FIRST_ROUNDS, _SHARPENING_ROUNDS, _LAST_ROUNDS = 8, 2, 12
+_FIRST_ITERATIONS, _SHARPENING_ROUNDS, _LAST_ITERATIONS = 8, 2, 12
 _START_BUFFERS = Buffers(8.0, 3.0, 3.5)  # when the reference is put on the voxels
 # Peaks measured, in volumes: 54 in a slab of 16 rows, with 48 rows of the reference; 42 in 64 rows that all of the
 # reference is in.
@@ -114,7 +114,7 @@ class FromReference(Method):
         assert self.reference is not None and control.decide is not None
         begin, history = control.now(), list[Progress]()
         halves = uses_half_voxels(self.half_voxels, problem.geometry, problem.grid)
-        planned = (1 + len(_ROUNDS)) * _FIRST_ROUNDS + (_SHARPENING_ROUNDS + COST * halves) * _LAST_ROUNDS
+        planned = (1 + len(_ROUNDS)) * _FIRST_ITERATIONS + (_SHARPENING_ROUNDS + COST * halves) * _LAST_ITERATIONS
 
         def report(iteration: int, residual: float) -> None:
             seconds = control.now() - begin
@@ -207,10 +207,10 @@ class _State:
             problem.first_sweep(x, problem.rng)
             start = np.where(moved.known(), start, x)
         fit = StateFit(problem, moved, start.astype(np.float32), weight, width)
-        fit.rounds(_ROUNDS, _FIRST_ROUNDS)
+        fit.rounds(_ROUNDS, _FIRST_ITERATIONS)
         # on whole voxels, faint lines cost 0.1 to 0.2 dB, and cracks become no deeper
-        fit.sharpen(_SHARPENING_ROUNDS, iterations=_LAST_ROUNDS, lines_from=ALL_LINES if self._halves else CLEAR_LINES)
-        if self._halves and (count := fit.on_half_voxels(iterations=_LAST_ROUNDS)):
+        fit.sharpen(_SHARPENING_ROUNDS, iterations=_LAST_ITERATIONS, lines_from=ALL_LINES if self._halves else CLEAR_LINES)
+        if self._halves and (count := fit.on_half_voxels(iterations=_LAST_ITERATIONS)):
             problem.decide.settings["half_voxel_iterations"] = count
         problem.decide.ended = None  # it describes only the last of several rounds
         self.moved = volume_slices(times_power(fit.m.copy(), problem.units.density))
