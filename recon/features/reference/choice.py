@@ -189,7 +189,7 @@ def _best_weight(trial: Trial, fit: StateFit) -> BestStrength | None:
 
     def residuals_of(weight: float) -> F64:
         other = fit.again(weight, fit.x)
-        other.sharpen(1, lines_from=CLEAR_LINES)
+        other.sharpen(1, CLEAR_LINES)
         return trial.residuals(other.x)
 
     return preferred_strength(residuals_of, fit.weight)
@@ -201,7 +201,7 @@ def _without(trial: Trial, fit: StateFit, smooth: F32, mu: float) -> BestStrengt
     def residuals_of(weight: float) -> F64:
         other = fit.again(weight, smooth)
         other.alone()
-        other.sharpen(1, lines_from=CLEAR_LINES)
+        other.sharpen(1, CLEAR_LINES)
         return trial.residuals(other.x)
 
     return preferred_strength(residuals_of, mu)

@@ -21,7 +21,7 @@ from scipy import ndimage as ndi
 from recon.base.arrays import F32
 from recon.base.decisions import GoesOn
 from recon.features.reference.motion import KNOTS, Basis, MotionViews, Moved, improved
-from recon.features.reference.weights import ALL_LINES, falling
+from recon.features.reference.weights import falling
 from recon.kernels.cpu.two_tv import ascend, pace_of, primal
 from recon.voxels.half_voxels import DUAL_STEPS, on_half_voxels, repeated
 from recon.voxels.ordered_fista import SUBSETS, Subsets, ordered_fista, subsets_of
@@ -180,7 +180,7 @@ class StateFit:
             self.follow(steps)
             self.solve(iterations=iterations)
 
-    def sharpen(self, rounds: int, iterations: int = _MOST_ITERATIONS, lines_from: float = ALL_LINES) -> None:
+    def sharpen(self, rounds: int, lines_from: float, iterations: int = _MOST_ITERATIONS) -> None:
         """Improve the volume in rounds in which the weights are lower where the change is steep, and along dark lines
         in particles. `lines_from` is explained in `falling`.
         """
@@ -188,7 +188,7 @@ class StateFit:
             own, change = falling(self.problem, self.moved, self.x, self.m, lines_from)
             self.solve(own, change, iterations)
 
-    def on_half_voxels(self, iterations: int = _MOST_ITERATIONS) -> int:
+    def on_half_voxels(self, lines_from: float, iterations: int = _MOST_ITERATIONS) -> int:
         """Improve the volume once more as `sharpen` does, but on half voxels, see `recon.voxels.half_voxels`.
 
         The moved reference and the weights are the same in the four half voxels of a voxel. This ends the fit: the
@@ -202,7 +202,7 @@ class StateFit:
         del self._prox
 
         def prox_of(fine: VoxelProblem) -> TwoVariations:
-            own, change = self._weights(*falling(self.problem, self.moved, self.x, self.m))
+            own, change = self._weights(*falling(self.problem, self.moved, self.x, self.m, lines_from))
             m, weights = repeated(self.m), difference_weights(fine.projector.grid)
             prox = TwoVariations(m.shape, weights, fine.nonnegative, DUAL_STEPS * _STEPS)
             prox.about(m, repeated(own), repeated(change))
