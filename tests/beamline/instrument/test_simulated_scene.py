@@ -126,7 +126,7 @@ def test_the_file_of_a_cone_gives_back_the_sample_where_it_stands(tmp_path: Path
     [
         ((), r"set optics.axis_col, here to 21: .*Nothing was started"),
         (("devices.camera.binning=2",), r"set optics.axis_col, here to 10\.25: .*Nothing"),
-        (("devices.camera.roi=[1100, 2028, 32, 40]",), r"32 rows must then begin at 1136, not at 1100\. Nothing"),
+        (("devices.camera.roi=[1100, 2028, 32, 40]",), r"begin the 32 rows at row 1136, not at 1100"),
     ],
 )
 def test_a_cone_that_its_file_could_not_tell_is_refused(tmp_path: Path, overrides: tuple[str, ...], words: str) -> None:

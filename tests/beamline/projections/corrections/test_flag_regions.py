@@ -90,6 +90,6 @@ def test_a_view_with_a_region_is_used_beside_it(tmp_path: Path) -> None:
     assert rays.shape == (30, 4, 40)
     assert (rays[4, :, 10:12] == 0).all() and (rays[5, :, 10:12] == WARNED_SHARE).all()
     assert (rays != 1).any(axis=(1, 2)).sum() == 2
-    assert "2 are flagged in a region" in told[0]
+    assert "2 are flagged in a part of the image" in told[0]
     kept = hold_out(prepared, 10, advice="")
     assert kept.sources.region_weights is not None and len(kept.sources.region_weights) == kept.geometry.n_views

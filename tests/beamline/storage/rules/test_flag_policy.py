@@ -50,7 +50,7 @@ def test_flags_are_counted_by_check_and_level(tmp_path: Path, alarms: range, sev
 
 
 IN_A_PART = (
-    "Of 18 projections, 4 are flagged in a region, in which rays have half weight (with an alarm: weight 0) "
+    "Of 18 projections, 4 are flagged in a part of the image, where rays have half weight (weight 0 for an alarm) "
     "(bands 4 alarm)."
 )
 
