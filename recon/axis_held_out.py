@@ -30,7 +30,7 @@ _WIDER_BOX = 2.0  # width of the box for a sample that is wider than the field o
 _STEPS = 8  # largest number of moves of the parabola's middle towards its vertex
 _LEAST_MEASURED_SHARE = 0.999  # share of a binned pixel that must have data
 # factor on the iterations: material that only half of the projections see converges late and shifts the axis
-_SHADOWED_SWEEPS = 3
+_SHADOWED_FACTOR = 3
 # share by which the best axis must lower the typical residual for the estimate to be confident
 _LEAST_IMPROVEMENT = 0.1
 
@@ -76,7 +76,7 @@ def axis_by_views(
     if lit is not None:
         data, known = (np.where(lit, projections, np.float32(other)) for other in (0, np.nan))
     width = _WIDER_BOX if reach_of(Views(known, geometry)).edges.beyond(0.0) else 1.0
-    longer = 1 if lit is None else _SHADOWED_SWEEPS
+    longer = 1 if lit is None else _SHADOWED_FACTOR
     tested_columns = list[float]()
 
     def ask(column: float) -> None:

@@ -28,7 +28,7 @@ from recon.voxels.view_weights import density_gain
 HALO = 8  # smallest number of slices on each side of a slab that its error bars need
 LEAST_VIEWS = 8
 
-_WEIGHT_DIFFERENCE = 0.5  # one half of the projections weighs this much more, the other half this much less
+_WEIGHT_CHANGE = 0.5  # one half of the projections weighs this much more, the other half this much less
 _REFIT_SHARE = 0.2  # share of a method's iterations in each of the two refits
 # side, in voxels, of the cube over which variances are averaged; the variance from a single voxel is uncertain by a
 # factor of 1.4
@@ -192,7 +192,7 @@ def _refitted(
     go_on = GoesOn(progress)
     volumes: list[F32] = []
     for sign in (1, -1):
-        trusted = known_views.weighed(1 + np.float32(sign * _WEIGHT_DIFFERENCE) * signs)
+        trusted = known_views.weighed(1 + np.float32(sign * _WEIGHT_CHANGE) * signs)
         decide = Decisions(problem.seed, follow)
         refitted = solve_views(
             refit, projector, trusted, start=volume, nonnegative=not method.allow_negative, go_on=go_on,
@@ -203,9 +203,10 @@ def _refitted(
         follow = decide.made
         volumes.append(refitted.data)
     heavier, lighter = volumes
-    heavier -= lighter
-    heavier *= np.float32(0.5 / _WEIGHT_DIFFERENCE)
-    return heavier, follow
+    deviation = heavier
+    deviation -= lighter
+    deviation *= np.float32(0.5 / _WEIGHT_CHANGE)
+    return deviation, follow
 
 
 def _of_run(decided: Mapping[str, Sequence[Any]], sweeps: int) -> dict[str, list[Any]]:

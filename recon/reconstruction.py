@@ -185,8 +185,8 @@ def _refuse_geometry(geometry: Geometry) -> None:
     """Raise ValueError if all projections are from one side, or if the axis is outside the detector."""
     # Parallel projections 180° apart contain the same rays, so |sin| of the angle between two shows whether they
     # differ. Projections of a cone, and those with a tilt along the beam, differ up to 360°.
-    angle_from_first = (geometry.angles - geometry.angles[0]) / (2 if geometry.is_cone or geometry.tilt.any() else 1)
-    if np.abs(np.sin(angle_from_first)).max() < 1e-6:
+    scaled_angle = (geometry.angles - geometry.angles[0]) / (2 if geometry.is_cone or geometry.tilt.any() else 1)
+    if np.abs(np.sin(scaled_angle)).max() < 1e-6:
         raise ValueError(
             "give projections at two or more different angles, because one direction does not determine a volume; "
             f"got {geometry.n_views} from one side ({np.rad2deg(geometry.angles[0]):g} degrees)"

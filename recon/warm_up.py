@@ -112,16 +112,16 @@ def toy_of(geometry: Geometry | None = None, times: int = 1) -> tuple[F32, Geome
     The four projections have the same beam, roll, tilt and shifts as `geometry`. They cover 360° if `geometry` does.
     The four projections are repeated `times` times.
     """
-    one_turn = views = _views_like(geometry)
+    views_once = views = _views_like(geometry)
     for _ in range(times - 1):
-        views = views.followed_by(one_turn)
-    width, density = _blob(one_turn)
-    rows, cols = (np.arange(n) for n in one_turn.detector_shape)
-    col, row = np.array([one_turn.origin(view) for view in range(one_turn.n_views)]).T[:, :, None]
-    u, v = (cols - col) * one_turn.pixel_pitch, (rows - row) * one_turn.pixel_pitch
+        views = views.followed_by(views_once)
+    width, density = _blob(views_once)
+    rows, cols = (np.arange(n) for n in views_once.detector_shape)
+    col, row = np.array([views_once.origin(view) for view in range(views_once.n_views)]).T[:, :, None]
+    u, v = (cols - col) * views_once.pixel_pitch, (rows - row) * views_once.pixel_pitch
     from_axis = u[:, None, :] ** 2 + v[:, :, None] ** 2  # mm² at the point where the ray meets the detector
-    if one_turn.is_cone:  # mm² at the point where the ray passes the origin
-        from_axis *= one_turn.sod**2 / (one_turn.sdd**2 + from_axis)
+    if views_once.is_cone:  # mm² at the point where the ray passes the origin
+        from_axis *= views_once.sod**2 / (views_once.sdd**2 + from_axis)
     lines = density * width * np.sqrt(2 * np.pi) * np.exp(-from_axis / (2 * width**2))
     return np.tile(lines.astype(np.float32), (times, 1, 1)), views
 

@@ -57,8 +57,8 @@ class _Messages:
             case "input" | "pause", _:
                 self.needs.append(ScanNeeds(operator=(OperatorRequest("answer the plan, or resume it", 1),)))
             case "locate", Rotation() as stage:
-                degrees = math.degrees(self.places.get(stage, stage.radians))
-                return {"setpoint": degrees, "readback": degrees}
+                angle_deg = math.degrees(self.places.get(stage, stage.radians))
+                return {"setpoint": angle_deg, "readback": angle_deg}
             case "kickoff" | "complete" | "wait", _:
                 pass
             case _:

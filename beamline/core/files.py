@@ -223,10 +223,10 @@ def refuse_existing(path: Path) -> None:
     A result never replaces anything, not even a broken link, and the folder must exist.
     """
     longest = os.pathconf(path.parent, "PC_NAME_MAX") if hasattr(os, "pathconf") and path.parent.is_dir() else 255
-    if len(os.fsencode(path.name)) > (longest_name := longest - _BESIDE):
+    if len(os.fsencode(path.name)) > (most_bytes := longest - _BESIDE):
         n_bytes = len(os.fsencode(path.name))
         raise DataError(
-            f"{path}: the name is too long: {n_bytes} bytes, at most {longest_name} are allowed, because the program "
+            f"{path}: the name is too long: {n_bytes} bytes, at most {most_bytes} are allowed, because the program "
             "also writes files with longer names next to it (temporary files, the report). Use a shorter name. Nothing "
             "was written."
         )

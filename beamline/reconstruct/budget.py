@@ -32,15 +32,15 @@ def in_budget(
     """
     end = now() + budget
     timing = Timing(geometry, grid, now, _TIMED_VOXELS)
-    affordable, seconds, too_slow = list[Method](), dict[str, float](), list[str]()
+    affordable, seconds, refusals = list[Method](), dict[str, float](), list[str]()
     for each in method.alternatives:
         try:
             seconds[each.name] = timing.of(each).most
             affordable.append(each)
         except ValueError as error:
-            too_slow.append(f"{each.name}: {error}")
+            refusals.append(f"{each.name}: {error}")
     if not affordable:
-        raise ValueError("; ".join(too_slow))
+        raise ValueError("; ".join(refusals))
     chosen, expected = _without_slow(method, affordable), 0.0
     while (expected := timing.of(chosen).most) > end - now() and len(affordable) > 1:
         affordable.remove(max(affordable, key=lambda each: seconds[each.name]))

@@ -203,8 +203,8 @@ def kmeans_mask(volume: Array, seed: int = 0) -> NDArray[np.int8]:
     if not np.isfinite(values).all():
         raise ValueError("the volume contains NaN or infinite values")
     rng = np.random.default_rng(seed)
-    sampled = tuple(rng.integers(0, n, _SAMPLE) for n in values.shape) if values.size > _SAMPLE else ...
-    sample = np.asarray(values[sampled], np.float64).ravel()
+    sample_indices = tuple(rng.integers(0, n, _SAMPLE) for n in values.shape) if values.size > _SAMPLE else ...
+    sample = np.asarray(values[sample_indices], np.float64).ravel()
     if np.ptp(sample) == 0:
         raise ValueError(
             f"all voxels have the value {sample[0]:g}, so there are no two regions that a threshold could separate"

@@ -55,9 +55,9 @@ def _split(ascending: NDArray[np.float64], least: int) -> tuple[float, int]:
         return 0.0, 0
     centred = ascending - ascending.mean()
     lower = np.cumsum(centred)[candidates - 1]
-    variance_between = lower**2 / candidates + lower**2 / (n - candidates)  # the sum of all is 0
-    best = int(variance_between.argmax())
-    gain = float(variance_between[best])
+    squares_between = lower**2 / candidates + lower**2 / (n - candidates)  # the sum of all is 0
+    best = int(squares_between.argmax())
+    gain = float(squares_between[best])
     return (gain, int(candidates[best])) if gain > _SPLIT * float(centred @ centred) else (0.0, 0)
 
 

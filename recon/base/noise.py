@@ -116,9 +116,11 @@ def _beyond_the_bow_tie(lines: F32, geometry: Geometry) -> float:
     count = len(spectrum)
     power = np.abs(np.fft.fft(spectrum, axis=0)) ** 2 / (count * (window**2).sum())
     reach = half + 0.5 + float(np.ptp(axis))
-    distance = reach * geometry.sample_pitch / geometry.sod
+    reach_ratio = reach * geometry.sample_pitch / geometry.sod
     bound = (
-        reach / (1 - distance) * (omega + 4 * np.pi / chosen.size) + 2 if distance < 1 else np.full(bins.size, np.inf)
+        reach / (1 - reach_ratio) * (omega + 4 * np.pi / chosen.size) + 2
+        if reach_ratio < 1
+        else np.full(bins.size, np.inf)
     )
     free = np.abs(np.fft.fftfreq(count) * count)[:, None] > bound
     sampled = power[free]

@@ -143,10 +143,10 @@ def steadiness(sinograms: F32, axis_col: float) -> Steadiness | None:
         return None
     fine = np.stack([[_fine_columns(sinograms[block, row]) for row in range(rows)] for block in blocks])
     own, mirrored_values = fine[..., right_columns], mirrored(fine, axis_col)[..., right_columns]
-    half_difference, half_sum = (own - mirrored_values) / math.sqrt(2), (own + mirrored_values) / math.sqrt(2)
-    mean = half_difference.mean(axis=0)
-    noise = median_deviation(half_difference - mean) / math.sqrt(len(blocks) - 1)
-    return Steadiness(median_deviation(mean), median_deviation(half_sum.mean(axis=0)), noise)
+    odd_part, even_part = (own - mirrored_values) / math.sqrt(2), (own + mirrored_values) / math.sqrt(2)
+    mean = odd_part.mean(axis=0)
+    noise = median_deviation(odd_part - mean) / math.sqrt(len(blocks) - 1)
+    return Steadiness(median_deviation(mean), median_deviation(even_part.mean(axis=0)), noise)
 
 
 def _fine_columns(sinogram: F32) -> NDArray[np.floating]:

@@ -104,8 +104,8 @@ def vectors_of(geometry: Geometry) -> F64:
     rows, cols = geometry.detector_shape
     axes = np.array([geometry.axes(view) for view in range(geometry.n_views)])
     along_cols, along_rows, beam = axes.transpose(1, 0, 2)
-    origins = np.array([geometry.origin(view) for view in range(geometry.n_views)]) - ((cols - 1) / 2, (rows - 1) / 2)
-    middle = -geometry.pixel_pitch * (origins[:, :1] * along_cols + origins[:, 1:] * along_rows)
+    offsets = np.array([geometry.origin(view) for view in range(geometry.n_views)]) - ((cols - 1) / 2, (rows - 1) / 2)
+    middle = -geometry.pixel_pitch * (offsets[:, :1] * along_cols + offsets[:, 1:] * along_rows)
     first = beam
     if geometry.is_cone:
         first = geometry.centres - geometry.sod * beam

@@ -119,9 +119,9 @@ def spread_views(angles: NDArray[np.float64], n: int, frames: NDArray[np.int64])
         return frames
     if np.ptp(angles) < 1.5 * np.pi:
         return frames[spread(all_numbers, n)]
-    first_half = spread(all_numbers, n // 2)
-    distances = np.abs(np.mod(angles[first_half][:, None] - angles + np.pi, 2 * np.pi) - np.pi)
-    return frames[np.union1d(first_half, distances.argmax(axis=1))]
+    spread_half = spread(all_numbers, n // 2)
+    distances = np.abs(np.mod(angles[spread_half][:, None] - angles + np.pi, 2 * np.pi) - np.pi)
+    return frames[np.union1d(spread_half, distances.argmax(axis=1))]
 
 
 def spread(items: NDArray[np.int64], n: int) -> NDArray[np.int64]:

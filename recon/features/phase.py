@@ -173,13 +173,13 @@ def length_by_held_out_views(
         for exponent in (-0.5, 0.0, 0.5)
     )
     best_square = min(nearby_squares, key=lambda square: float(residuals_of(square).mean()))
-    filtered_best, unfiltered = residuals_of(best_square), residuals_of(0.0)
-    if not exceeds_standard_error(unfiltered - filtered_best, _STANDARD_ERRORS):
+    best_residuals, residuals_without = residuals_of(best_square), residuals_of(0.0)
+    if not exceeds_standard_error(residuals_without - best_residuals, _STANDARD_ERRORS):
         return None
-    weaker, stronger = (residuals_of(best_square * 2.0**exponent) - filtered_best for exponent in (-0.5, 0.5))
+    weaker, stronger = (residuals_of(best_square * 2.0**exponent) - best_residuals for exponent in (-0.5, 0.5))
     # The search uses factors of √2, then the vertex of a parabola, for each projection. Factors of 2 would cost 1 dB.
     to_vertex = (weaker - stronger) / (2 * float((weaker + stronger).mean()))
     factor = 2.0 ** float(to_vertex.std(ddof=1) / (2 * math.sqrt(to_vertex.size)))
     square = best_square * 2.0 ** float(to_vertex.mean() / 2)
-    residual_drop = 1 - float(filtered_best.mean() / unfiltered.mean())
+    residual_drop = 1 - float(best_residuals.mean() / residuals_without.mean())
     return FilterLength(math.sqrt(square), factor, residual_drop)

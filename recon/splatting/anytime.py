@@ -30,7 +30,7 @@ from recon.voxels.projector import Projector
 
 HALF = 60.0  # number of steps after which the rates are half of the first ones
 _WINDOW = 0.25  # share of the steps over which the mean is computed
-_MEAN_STEPS = 4  # steps between two terms of the mean
+_STEPS_BETWEEN_TERMS = 4  # steps between two terms of the mean
 
 WHILE_VIEWS_COME = FitSettings(decay=0.02, policy=DensityPolicy(start=0.0, stop=2.0))
 """Settings of a fit during a scan. They differ from those of a fit to all projections by lower final rates.
@@ -65,13 +65,13 @@ def average(state: FitState, since: int) -> None:
     Args:
         since: the step from which the last quarter is counted.
     """
-    if state.step % _MEAN_STEPS:
+    if state.step % _STEPS_BETWEEN_TERMS:
         return
     settle(state)
     if state.mean is None:
         state.mean = {name: values + 0 for name, values in state.parameters.items()}
         return
-    share = _MEAN_STEPS / (_MEAN_STEPS + _WINDOW * (state.step - since))
+    share = _STEPS_BETWEEN_TERMS / (_STEPS_BETWEEN_TERMS + _WINDOW * (state.step - since))
     for name, values in state.parameters.items():
         state.mean[name] += share * (values - state.mean[name])
 

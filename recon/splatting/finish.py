@@ -63,9 +63,9 @@ def beyond_voxels(gaussians: Gaussians, views: Geometry, grid: Grid, settings: F
     gaussians = gaussians.select(is_outside.any(dim=1))
     if not gaussians.n:
         return None
-    lines_inside = voxel_means(gaussians, grid, views, truncation=settings.truncation).numpy()
+    density_inside = voxel_means(gaussians, grid, views, truncation=settings.truncation).numpy()
     model = project(gaussians, views, truncation=settings.truncation, model=settings.rays).numpy()
-    return model - Projector(views, grid).forward(np.maximum(lines_inside, 0))
+    return model - Projector(views, grid).forward(np.maximum(density_inside, 0))
 
 
 def level_of(beyond: F32) -> F32:

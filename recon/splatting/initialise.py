@@ -272,12 +272,12 @@ def _smoothed(x: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
 
 def neighbour_distance(means: NDArray[np.float64]) -> NDArray[np.float64]:
     """Root mean square distance [n] of each point to its three nearest neighbours; infinite for a single point."""
-    n_neighbours = min(4, means.shape[0])
-    if n_neighbours < 2:
-        return np.full(n_neighbours, np.inf)
+    n_queried = min(4, means.shape[0])
+    if n_queried < 2:
+        return np.full(n_queried, np.inf)
     from scipy.spatial import cKDTree
 
-    distances = np.asarray(cKDTree(means).query(means, k=n_neighbours, workers=get_num_threads())[0])
+    distances = np.asarray(cKDTree(means).query(means, k=n_queried, workers=get_num_threads())[0])
     return np.sqrt((distances[:, 1:] ** 2).mean(axis=1))
 
 

@@ -188,14 +188,14 @@ def _fused(
     state: FitState, problem: FitProblem, settings: FitSettings, update: _Update, box: _RandomBox | None
 ) -> FusedStep | None:
     """The fused step of this state on the device. The same fused step is used again as long as its plan is the same."""
-    shape, state_before = None if box is None else box.shape, state.fused
+    shape, fused_before = None if box is None else box.shape, state.fused
     key = (
         problem.loss, problem.grid, settings.truncation, settings.rays, settings.views_per_step,
         settings.tv_moves, update.bounds, shape, any(weights is not None for weights in problem.weights),
     )  # fmt: skip
     raw = state.parameters[NAMES[-1]]
-    if state_before is not None and state_before.plan.key == key and state_before.model.parameters[-1] is raw:
-        return state_before
+    if fused_before is not None and fused_before.plan.key == key and fused_before.model.parameters[-1] is raw:
+        return fused_before
     settle(state)
     truncation = settings.truncation
     small_grid = None if box is None else replace(box.grid(problem.grid), centre=(0.0, 0.0, 0.0))
@@ -208,7 +208,7 @@ def _fused(
         tuple(arrays[name] for name in NAMES) for arrays in (state.parameters, state.first, state.second)
     )
     model = StepModel(parameters, first, second, state.statistic, state.loss, state.residual)
-    state.fused = problem.backend.fused_step(model, plan, state_before)
+    state.fused = problem.backend.fused_step(model, plan, fused_before)
     return state.fused
 
 

@@ -150,8 +150,8 @@ def _halves(log_scales: F32, rotations: F32) -> tuple[F32, F32, F32, float]:
         divisor of their density.
     """
     index, axis = np.arange(len(log_scales)), log_scales.argmax(axis=1)
-    displacement, shrink = APART * np.exp(log_scales[index, axis]), math.sqrt(1 - APART**2)
-    offset = (displacement[:, None] * rotations[index, :, axis]).astype(np.float32)
+    distance, shrink = APART * np.exp(log_scales[index, axis]), math.sqrt(1 - APART**2)
+    offset = (distance[:, None] * rotations[index, :, axis]).astype(np.float32)
     narrower = np.zeros_like(log_scales)
     narrower[index, axis] = math.log(shrink)
     return offset, -offset, narrower, 2 * shrink

@@ -112,10 +112,10 @@ class StreamingFit:
             UserWarning: the angles so far look like degrees (at most one warning in a fit).
         """
         check_arguments(StreamingFit.add_views, locals())
-        theta, n_before = np.atleast_1d(np.asarray(angles, np.float64)), self._stage.views
-        images = checked_views(data, theta, n_before.template.detector_shape)
+        theta, views_before = np.atleast_1d(np.asarray(angles, np.float64)), self._stage.views
+        images = checked_views(data, theta, views_before.template.detector_shape)
         self._stage = self._stage.followed_by(images, theta)
-        if not look_like_degrees(n_before.angles, ended=False):  # otherwise this warning was given before
+        if not look_like_degrees(views_before.angles, ended=False):  # otherwise this warning was given before
             warn_of_degrees(self._stage.views.angles, ended=False)
         if isinstance(self._stage, Growing) and theta.size:
             self.unlearnt = _running_mean(self.unlearnt, *self._stage.newest(self.settings))

@@ -253,7 +253,7 @@ class Growing:
         return replace(model, unseen=())
 
     def _placed_again(self, plan: StreamPlan, is_early: bool, final: bool) -> Growing:
-        """The model with all Gaussians placed again, if it is `is_early` (many steps with few projections) or if the
+        """The model with all Gaussians placed again, if `is_early` (many steps with few projections) or if the
         first projections were empty; otherwise the same model."""
         # Either the sample or the beam came later, so that the density unit was computed from noise; or there were too
         # few projections.

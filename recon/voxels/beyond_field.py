@@ -215,18 +215,20 @@ def _predicting_radius(views: Views, reach: float) -> SampleRadius | None:
     is_plausible = cylinder is not None and reach < cylinder[0] <= _WIDEST * reach
     if cylinder is not None and is_plausible and predicts_as_well(cylinder[1], trials[best_ratio][0]):
         radius = cylinder[0] / reach
-        equal_ratios = [radius / _FINE, radius, radius * _FINE]
-        trials |= {ratio: trial.of_radius(ratio * reach) for ratio in equal_ratios}
+        equally_good_ratios = [radius / _FINE, radius, radius * _FINE]
+        trials |= {ratio: trial.of_radius(ratio * reach) for ratio in equally_good_ratios}
         best_ratio = radius
     else:
-        equal_ratios = [
+        equally_good_ratios = [
             ratio for ratio, (residuals, _) in trials.items() if predicts_as_well(residuals, trials[best_ratio][0])
         ]
-        radius = min(equal_ratios) * _FINE
-    equal_ratios += [ratio for ratio in trials if abs(math.log(ratio / radius, _FINE)) < 1.5]
-    densities = [trials[ratio][1] for ratio in equal_ratios]
+        radius = min(equally_good_ratios) * _FINE
+    equally_good_ratios += [ratio for ratio in trials if abs(math.log(ratio / radius, _FINE)) < 1.5]
+    densities = [trials[ratio][1] for ratio in equally_good_ratios]
     relative_error = (max(densities) - min(densities)) / 2 / trials[best_ratio][1] if trials[best_ratio][1] > 0 else 1.0
-    return SampleRadius(radius * reach, min(equal_ratios) * reach, max(equal_ratios) * reach, relative_error)
+    return SampleRadius(
+        radius * reach, min(equally_good_ratios) * reach, max(equally_good_ratios) * reach, relative_error
+    )
 
 
 def _cylinder(trial: _Trial) -> tuple[float, F64] | None:

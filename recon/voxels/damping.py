@@ -94,11 +94,11 @@ def largest_damped(projector: Projector, weight: F32 | None, damping: Damping) -
     SIAM J. Matrix Anal. Appl. 13, 1094.)
     """
     device = voxel_device(projector.device)
-    projector_of_one_row = one_of_like_rows(projector.plain, weight)
-    lines, (nz, ny, nx) = projector_on(device, projector_of_one_row), projector_of_one_row.grid.shape
+    projector_of_like_rows = one_of_like_rows(projector.plain, weight)
+    lines, (nz, ny, nx) = projector_on(device, projector_of_like_rows), projector_of_like_rows.grid.shape
     row_damping = replace(damping, shape=(ny, nx, nz))
     root = None if weight is None else device.array(np.sqrt(weight))
-    noise = np.random.default_rng(0).standard_normal(_ray_shape(projector_of_one_row), np.float32)
+    noise = np.random.default_rng(0).standard_normal(_ray_shape(projector_of_like_rows), np.float32)
     q = device.array(noise if weight is None else noise * (weight > 0))
     size, previous = device.norm(q), device.zeros(noise.shape)
     diagonal, off_diagonal = list[float](), list[float]()

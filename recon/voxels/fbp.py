@@ -29,7 +29,7 @@ from recon.voxels.field_edges import FARTHEST, edge_levels, ends_in_matter, samp
 from recon.voxels.view_weights import column_shares, ray_weights, seen_by, slice_weights
 
 _VIEWS = 32  # projections filtered at a time
-_LEVEL_COLUMNS = 5  # columns
+_FEW_COLUMNS_FARTHER = 5  # columns
 
 
 def ramp(n: int, pixel_pitch: float, filter: Filter) -> NDArray[np.float32]:
@@ -93,7 +93,7 @@ def continuation(
     """
     cols, axes, input_weights = mean.shape[1], geometry.axis_col + geometry.offsets[:, 0], weights
     edges = np.array([(axis := float(axes.mean())) + 0.5, cols - 0.5 - axis])
-    if not geometry.is_cone and np.abs(2 * axes + 1 - cols).max() <= _LEVEL_COLUMNS:
+    if not geometry.is_cone and np.abs(2 * axes + 1 - cols).max() <= _FEW_COLUMNS_FARTHER:
         weights = np.repeat(weights[:, round(axis) + 1, None], cols + 2, axis=1)
     cut = ends_in_matter(mean) & weights[:, (0, -1)].any(axis=0)
     cut_rows = np.flatnonzero(cut.any(axis=1))

@@ -92,16 +92,16 @@ def measured_law(
     # width of the sample over that of the field of view
     width = 1.0 if sample is None else sample.radius / geometry.reach
     slab = _Slab.of(data, geometry, width, open_beam)
-    most_views, held_out = split_views(slab.geometry)
+    fitted_views, held_out = split_views(slab.geometry)
     half_of_views = split_views(slab.geometry, 2)[1]  # every second projection by angle, without the held-out ones
     method = _TotalVariation(slab.chosen_weight())
-    volumes = [slab.volume(method, slab.views, used) for used in (half_of_views, most_views)]
+    volumes = [slab.volume(method, slab.views, used) for used in (half_of_views, fitted_views)]
     if not volumes[1].any():
         raise ValueError(
             "the error against the number of projections was not measured, because the projections show no sample"
         )
     copy, second_copy = slab.copies(volumes[1], rng)
-    copied = [slab.volume(method, copy, used) for used in (half_of_views, most_views)]
+    copied = [slab.volume(method, copy, used) for used in (half_of_views, fitted_views)]
     errors = [slab.square_error(volume, volumes[1]) for volume in copied]
     noise = slab.square_error(copied[0], slab.volume(method, second_copy, half_of_views)) / 2 / max(errors[0], _TINY)
     fall_ratio = _fall_ratio(
@@ -120,7 +120,7 @@ def measured_law(
         return error_law, None
     # fall of the error in the scan, from half to seven eighths of the projections
     fall = _VOLUME_OVER_VIEWS * fall_ratio * math.log(errors[0] / errors[1])
-    return error_law, fall / math.log(len(most_views) / len(half_of_views)) * 10 * math.log10(n / views_at_ends[-2])
+    return error_law, fall / math.log(len(fitted_views) / len(half_of_views)) * 10 * math.log10(n / views_at_ends[-2])
 
 
 def _fall_ratio(scan: Sequence[float], copy: Sequence[float]) -> float | None:

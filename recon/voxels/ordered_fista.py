@@ -195,7 +195,7 @@ class _Descent:
             self._rays = device.array(problem.weight)
         self._all = _Part(projector_on(device, problem.projector), slice(None))
         of_subsets = zip(subsets.projectors, subsets.views, strict=True)
-        self._parts = [_Part(projector_on(device, part), rays_of_subset) for part, rays_of_subset in of_subsets]
+        self._parts = [_Part(projector_on(device, part), views_of_subset) for part, views_of_subset in of_subsets]
         if len(self._parts) == 1:
             self._parts = [self._all]
         self._subsets, self._pull, self._problem = subsets, pull, problem
@@ -255,11 +255,11 @@ class _Descent:
                 cells -= self._slope * np.float32(1 / count)
             damping.take_off(device, self._gradient, cells)
         device.combine(1.0, x, length, self._gradient, x)
-        last_cells = damping.cells(device, x) if damping.gain > 1 else None
+        cells_before = damping.cells(device, x) if damping.gain > 1 else None
         self._prox(x, mu * length)
         self._prox.turn()
-        if last_cells is not None:
-            self._slope = last_cells
+        if cells_before is not None:
+            self._slope = cells_before
             self._slope -= damping.cells(device, x)
             self._slope *= np.float32(count / length)
 

@@ -155,8 +155,8 @@ def _compared(grid: Grid, views: Views, most_views: int) -> Iterator[_Compared]:
     for positions in np.array_split(np.arange(sampled_views.size), 1 if bands else min(sampled_views.size, _GROUPS)):
         geometry = views.geometry.select(sampled_views[positions])
         for rows in _bands(views, sampled_views) if bands else [slice(0, geometry.detector_shape[0])]:
-            _, part, slices = part_of(geometry, grid, rows) if bands else (rows, geometry, grid)
-            yield _Compared(part, slices, rows, sampled_views[positions], positions)
+            _, geometry_of_part, slices = part_of(geometry, grid, rows) if bands else (rows, geometry, grid)
+            yield _Compared(geometry_of_part, slices, rows, sampled_views[positions], positions)
 
 
 def _measured(views: Views, part: _Compared) -> tuple[F32, Mask, F32]:

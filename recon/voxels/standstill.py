@@ -85,7 +85,7 @@ class Standstill:
 
 
 def with_quality(method: MethodT, quality: Quality) -> MethodT:
-    """A method with `still_factor` and `iterations` changed for a preset: "best" ends nearer to the minimum, "preview"
+    """A method with `still` and `iterations` changed for a preset: "best" ends nearer to the minimum, "preview"
     farther from it.
     """
     still_factor, iterations_factor = _QUALITIES[quality]

@@ -15,7 +15,9 @@ _GAP_LIMIT = 8.0  # an angular gap this many times the usual one may be missing 
 # a wider gap is missing data, even if there are many such gaps, unless most projections are as far apart
 _WIDEST_USUAL_ANGLE = np.pi / 6
 _MOST_USUAL_STEPS = 2.5  # most usual steps between the projections of a part of a scan
-_NOT_RANDOM = 0.4  # standard deviation of gaps over their mean: 0.24 for golden angles, about 0.7 for random ones
+_LARGEST_REGULAR_VARIATION = (
+    0.4  # standard deviation of gaps over their mean: 0.24 for golden angles, about 0.7 for random ones
+)
 _SAME_ANGLE = 1e-3  # share of the mean step; projections that are closer share one weight
 
 
@@ -326,7 +328,7 @@ def _missing(gaps: F64, circle: float) -> NDArray[np.bool_]:
     One of n random gaps exceeds a share x of the circle with a probability of at most n (1 - x)^(n - 1). The limit is 1
     in 1000, or 1 in 20 if the other gaps are so similar that the angles are not random.
     """
-    probability = 1e-3 if (others := np.sort(gaps)[:-1]).std() > _NOT_RANDOM * others.mean() else 0.05
+    probability = 1e-3 if (others := np.sort(gaps)[:-1]).std() > _LARGEST_REGULAR_VARIATION * others.mean() else 0.05
     return gaps > max(_GAP_LIMIT * _usual(gaps), circle * (1 - (probability / gaps.size) ** (1 / (gaps.size - 1))))
 
 

@@ -295,7 +295,7 @@ class Momentum:
     O'Donoghue & Candès 2015, Found. Comput. Math. 15, 715, eq. 13. Memory: two volumes. Arrays are those of a device.
 
     Args:
-        most: largest share of the last step that is added.
+        largest_momentum: largest share of the last step that is added.
     """
 
     def __init__(

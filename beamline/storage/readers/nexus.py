@@ -223,8 +223,10 @@ def read_geometry(places: Places) -> NexusGeometry:
         sod, sdd = cone
         pixels = [theirs * sdd / sod if theirs else ours for theirs, ours in zip(at_sample, own, strict=True)]
     mirrored, turned = _mirrored(detector)
-    if mirrored_text := [name for name, is_so in zip(("upside down", "left to right"), mirrored, strict=True) if is_so]:
-        remarks["flipped"] = f"{' and '.join(mirrored_text)}: frames are mirrored back when they are read"
+    if mirrored_directions := [
+        name for name, is_so in zip(("upside down", "left to right"), mirrored, strict=True) if is_so
+    ]:
+        remarks["flipped"] = f"{' and '.join(mirrored_directions)}: frames are mirrored back when they are read"
     pixel_sizes = [own[0] or pixels[0], own[1] or pixels[1] or own[0]]
     row, col = (_central(places, i, pixel_sizes[i], mirrored[1 - i]) for i in (1, 0))
     return NexusGeometry((pixels[0], pixels[1]), cone, (row, col), mirrored, turned, remarks)

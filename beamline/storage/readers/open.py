@@ -269,11 +269,11 @@ def _true_type(source: ScanSource) -> np.dtype[Any] | None:
 
 def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
     for kind in (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK):
-        images = examined(source, kind)
-        if images.size:
+        frame_numbers = examined(source, kind)
+        if frame_numbers.size:
             stride = max(1, source.shape[0] * source.shape[1] // _PIXELS, source.frame_bytes // UNPACKED)
             with suppress(DataError):  # an unreadable frame is reported where it is used
-                yield read_known(source, images[:1] if stride > 1 else images, slice(None, None, stride))
+                yield read_known(source, frame_numbers[:1] if stride > 1 else frame_numbers, slice(None, None, stride))
 
 
 def _refuse(options: SourceOptions, follow: bool) -> None:

@@ -79,8 +79,8 @@ def altered_sentence(source: ScanSource) -> str:
 def references_present(scan: ScanEvidence) -> Iterator[Finding]:
     """A scan whose pixels are counts has darks and flats."""
     if "beside" in scan.source.attributes:
-        folder = scan.source.attributes["beside"]
-        sentence = f"The darks and flats next to the projections are used: {folder}."
+        folders = scan.source.attributes["beside"]
+        sentence = f"The darks and flats next to the projections are used: {folders}."
         yield Finding("info", "references", sentence)
     for name, kind in (("flats", FrameKind.FLAT), ("darks", FrameKind.DARK)):
         if scan.in_counts and not scan.table.of_kind(kind).size:

@@ -38,7 +38,7 @@ _ONE_IN = 6  # one in this many projections is held out
 _TV_WEIGHT = 1e-3  # with three times this weight, a sixth of a ball on the axis would be removed
 _FIRST_SWEEPS, _SWEEPS, _ROUNDS = 8, 4, 4
 # the mean square in held-out projections must fall to this share; see `exceeds_standard_error`
-_LARGEST_ERROR_RATIO, _STANDARD_ERRORS = 0.99, 3.0
+_LARGEST_SQUARES_RATIO, _STANDARD_ERRORS = 0.99, 3.0
 _EXAMINED_ROWS = 8  # number of rows that are examined
 _BUFFERS = Buffers(8.5, 7.0, 5.0)
 
@@ -110,7 +110,7 @@ def learn_gains(
             errors_with = band.errors(volume, pixels, unseen, own)
             if not (
                 exceeds_standard_error(errors_without - errors_with, _STANDARD_ERRORS)
-                and errors_with.mean() < _LARGEST_ERROR_RATIO * errors_without.mean()
+                and errors_with.mean() < _LARGEST_SQUARES_RATIO * errors_without.mean()
             ):
                 return LearntGains(np.zeros_like(gains), _root(errors_without), _root(errors_with), False)
     return LearntGains(gains, _root(errors_without), _root(errors_with), True)

@@ -241,9 +241,9 @@ class _Model:
     def adjoint(self, images: F32) -> F32:
         volume = self._projector.adjoint_lines(images)
         if self._tilt and not self.geometry.is_cone:
-            displaced_images = np.float32(self._tilt) * _along_rows(images)
-            volume += self._y * self._projector.adjoint_lines(displaced_images * self._cos)
-            volume -= self._x * self._projector.adjoint_lines(displaced_images * self._sin)
+            tilt_changes = np.float32(self._tilt) * _along_rows(images)
+            volume += self._y * self._projector.adjoint_lines(tilt_changes * self._cos)
+            volume -= self._x * self._projector.adjoint_lines(tilt_changes * self._sin)
         return volume
 
     def by_tilt(self, volume: F32) -> F32:

@@ -128,8 +128,8 @@ def learnt_motion(
     views, times, weights = of_moments
     cols = views.geometry.detector_shape[1]
     one_material = replace(views, cross_sections=np.ones((times.size, 1)))
-    motion, remaining = None, SWEEPS_OF_TURN * sum(fits for _, fits in levels(cols))
-    for binning, fits in levels(cols):
+    motion, remaining = None, SWEEPS_OF_TURN * sum(alternations for _, alternations in levels(cols))
+    for binning, alternations in levels(cols):
         binned = _binned(one_material, binning)
         grid = Grid.matching(binned.geometry)
         nz, ny, nx = grid.shape
@@ -137,7 +137,7 @@ def learnt_motion(
             Motion.none((ny, nx, nz), times, _KNOTS, _CONTROLS) if motion is None else motion.on((ny, nx, nz), times)
         )
         fit, energies = EnergyFit(binned, grid, np.random.default_rng(0), motion, stop), _seen(binned, grid)
-        for _ in range(fits):
+        for _ in range(alternations):
             for residual in fit.sweeps(np.full(1, _WEIGHT_FACTOR * weights.max()), SWEEPS_OF_TURN):
                 remaining -= 1
                 if not go_on(-remaining, residual):

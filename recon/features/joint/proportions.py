@@ -29,7 +29,7 @@ from recon.features.joint.spectral import Materials
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
 # first λ, divided by the mean curvature of the projections; ratio of the next λ to it; number of tests
-_LARGEST_SMOOTHNESS, _SMOOTHNESS_STEP, _TRIALS = 32.0, 3.0, 9
+_LARGEST_SMOOTHNESS, _SMOOTHNESS_RATIO, _TRIALS = 32.0, 3.0, 9
 _TIME_WEIGHT = 0.03  # the constant τ
 SOLUTION_STEPS, _TRIAL_STEPS = 60, 20  # number of conjugate-gradient iterations of the solution, and of a test
 TRIAL_STEPS = _TRIALS * _TRIAL_STEPS
@@ -172,7 +172,7 @@ def smoothness(fit: Proportions, judge: Proportions, first: F32, go_on: Callable
     best = np.full(judge.data.shape[0], np.inf)
     with suppress(StoppedError):
         for trial in range(_TRIALS):
-            smooth = _LARGEST_SMOOTHNESS / _SMOOTHNESS_STEP**trial
+            smooth = _LARGEST_SMOOTHNESS / _SMOOTHNESS_RATIO**trial
             factors = fit.solved(smooth, factors, go_on, _TRIAL_STEPS)
             trials.append((smooth, judge.left(factors)))
             best, worse = (trials[-1][1], 0) if trials[-1][1].sum() < best.sum() else (best, worse + 1)

@@ -147,7 +147,7 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     additional = np.where(moved.known(), 0, smooth).astype(np.float32)
     moved = affinely_moved(MotionViews.of(problem), moved, affine, additional)
     coefficients, gains = affine.nearest(moved.u) * affine.used, moved.gains[:2].tolist()
-    about_axis = about_reference(coefficients, reference, problem, width)
+    from_reference_middle = about_reference(coefficients, reference, problem, width)
     start = np.where(moved.known(), moved.volume(), smooth).astype(np.float32)
     fit = StateFit(problem, moved, start, _FIRST_CHANGE_WEIGHT * mu, width)
     fit.rounds(PLAN)
@@ -180,7 +180,10 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume) -> ReferenceVerd
     splines = Basis.splines(grid, width, KNOTS)
     bent = splines.nearest(fit.moved.u - padded(affine.field(coefficients)))
     edge = problem.units.projector(problem.projector, 1).grid.voxel_size
-    motion_mm = [(edge * motion_px).ravel().tolist() for motion_px in (about_axis, bent.mean(-1, keepdims=True))]
+    motion_mm = [
+        (edge * motion_voxels).ravel().tolist()
+        for motion_voxels in (from_reference_middle, bent.mean(-1, keepdims=True))
+    ]
     return ReferenceVerdict(True, residuals_text, of_scan, motion_mm[0], motion_mm[1], gains)
 
 

@@ -95,8 +95,8 @@ class Basis:
 
     def back(self, field: F32) -> F64:
         """The transpose of `field`."""
-        without_y = np.einsum("xq,ayxr->ayqr", self.x.astype(np.float32), field @ self.z.astype(np.float32))
-        return self.used * np.einsum("yp,ayqr->apqr", self.y, without_y.astype(np.float64))
+        summed_over_x_z = np.einsum("xq,ayxr->ayqr", self.x.astype(np.float32), field @ self.z.astype(np.float32))
+        return self.used * np.einsum("yp,ayqr->apqr", self.y, summed_over_x_z.astype(np.float64))
 
     def uniform_along_z(self) -> Basis:
         """The same functions of y and x, constant along the axis."""

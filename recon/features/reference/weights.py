@@ -38,7 +38,7 @@ _LENGTH, _BESIDE, _TURNS = 9, 2.5, 12
 
 
 def falling(problem: VoxelProblem, moved: Moved, x: F32, reference: F32, lines_from: float) -> tuple[F32, F32]:
-    """Factors [y, x, z] on the weight of x, and on the weight of the change x - m.
+    """Factors [y, x, z] on the weight of x, and on the weight of the change x - reference.
 
     Args:
         lines_from: standard deviations of the noise from which on a voxel of a dark line counts.
@@ -59,23 +59,23 @@ def dark_lines(problem: VoxelProblem, moved: Moved, x: F32, reference: F32) -> F
     """How much a line of voxels inside a particle is darker than both of its sides, in standard deviations of the
     noise.
 
-    Lines are searched for in the change x - m plus the filtered back-projection of the residual. The value is 0 outside
-    particles.
+    Lines are searched for in the change x - reference plus the filtered back-projection of the residual. The value is 0
+    outside particles.
     """
     particles = moved.particles
     residual = problem.views - problem.projector.forward_lines(x)
-    darkness, back_projected = x - reference, replace(problem, data=residual, measured=None).filtered("hann")
+    change, back_projected = x - reference, replace(problem, data=residual, measured=None).filtered("hann")
     if back_projected is not None:
-        darkness = darkness + back_projected
-    darkness = ndi.uniform_filter1d(darkness, min(3, darkness.shape[2]), axis=2, mode="nearest")
+        change = change + back_projected
+    change = ndi.uniform_filter1d(change, min(3, change.shape[2]), axis=2, mode="nearest")
     solid = reference > 0.5 * particles.level + particles.base
     inner = ndi.binary_erosion(solid, np.ones((3, 3, 1)))
-    best = np.zeros_like(darkness)
-    contrast = np.empty_like(darkness)
+    best = np.zeros_like(change)
+    contrast = np.empty_like(change)
     if not inner.any():
         return best
     for angle in np.arange(_TURNS) * np.pi / _TURNS:
-        weighted_sum(darkness, line_contrast(angle), contrast)
+        weighted_sum(change, line_contrast(angle), contrast)
         noise = 1.4826 * float(np.median(np.abs(contrast[inner])))
         np.maximum(best, contrast / np.float32(max(noise, 1e-30)), out=best)
     return np.where(solid, best, np.float32(0))
