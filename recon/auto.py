@@ -32,9 +32,9 @@ class Auto(Method):
     candidate whose volume predicts the held-out projections about as well as that of the best candidate.
 
     The tests use the sixteen rows with most material; in a cone beam, the sixteen rows in the middle. If the middle
-    rows contain little material, the tests use all rows at half the resolution. The test reconstructions hold out one
-    of eight projections, and need at least 16 projections; with fewer, `Auto` uses the last candidate. docs/choosing.md
-    explains this way to choose a method.
+    rows contain little material, the tests use all rows at half the resolution. The test reconstructions hold out every
+    eighth projection. They need at least 16 projections; with fewer, `Auto` takes the last of its candidates.
+    docs/choosing.md explains this way to choose a method.
 
     Attributes:
         candidates: the methods, the simplest and cheapest first.

@@ -174,8 +174,8 @@ class _Frames(DetectorAcquireLogic):
                     return
                 if frame_taken.framestamp != i:
                     raise InstrumentError(
-                        f"Leave more time between the frames, and repeat the exposures. {camera.name}: frames "
-                        f"were lost, because frame {frame_taken.framestamp} arrived instead of {i}. Earlier "
+                        f"Leave more time between the frames, and repeat the exposures. {camera.name}: frame "
+                        f"{frame_taken.framestamp} arrived where frame {i} was expected, so frames were lost. Earlier "
                         "frames are in the file."
                     )
                 row = writer.rows

@@ -78,8 +78,8 @@ def scans_in(folder: Path, warn: Warn) -> list[Path]:
     whole = [run for run in runs if run is not None and describe(run).state == State.DONE]
     if files and len(whole) < len(runs):
         warn(
-            f"{folder}: only {len(whole)} of {len(runs)} {_kind(config)} have a complete scan. The "
-            f"{len(files)} scans that have frames are used. `beamline scan --resume {folder}` takes the missing scans."
+            f"{folder}: only {len(whole)} of {len(runs)} {_kind(config)} have a complete scan. "
+            f"Scans with frames that are used: {len(files)}. `beamline scan --resume {folder}` takes the missing scans."
         )
     if not files:
         raise DataError(

@@ -214,7 +214,8 @@ def refuse_broken(group: h5py.Group, path: str) -> None:
     """Raise DataError if a path ends at a broken link."""
     if broken := broken_link(group, path):
         raise DataError(
-            f"{group.file.filename}: {broken}. Put the file to which the link points back into the folder of this file."
+            f"{group.file.filename}: {broken}. The link points to another file: put that file back into the folder of "
+            "this one."
         )
 
 

@@ -61,7 +61,7 @@ def read_volume(
     if not (is_hdf5 or is_numpy or name.endswith(SUFFIXES)):
         raise DataError(f"{path} is not a known volume file; the known suffixes are {', '.join(SUFFIXES)}.")
     if name.endswith((".npz", ".npy")) and not is_numpy:
-        raise DataError(f"{path} cannot be read: its content is neither .npz nor .npy, although its name says so.")
+        raise DataError(f"{path} cannot be read: its name ends in .npz or .npy, but its content is neither.")
     try:
         if name.endswith((".nii", ".nii.gz")):
             return _from_nifti(path)

@@ -182,7 +182,7 @@ class PvFilter(_PvDevice):
                 request=f"{self._setter.name} = {value}",
                 reply=f"{self._status.name} is {self._status_now()}",
                 expected=f"{value}",
-                advice="Check the position of the filter, and whether this computer has write access",
+                advice="Check the position of the filter, and whether this computer may write to the process variables",
             )
 
     def remember_place(self) -> Callable[[], str]:
@@ -285,7 +285,10 @@ class PvMonochromator(_PvDevice):
             request=f"{self._setter.name} = {wanted:.7g}",
             reply=f"{self._status.name} is {_valid(self._status, self.name)}",
             expected=f"{wanted:.7g}, within {pvs.tolerance * 1e-3 * pvs.per_kev:g}",
-            advice="Check the energy that the monochromator reports, and whether this computer has write access",
+            advice=(
+                "Check the energy that the monochromator reports, and whether this computer may write to the process "
+                "variables"
+            ),
         )
 
     def stop(self) -> None:

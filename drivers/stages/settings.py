@@ -48,7 +48,7 @@ class StageFigures(CheckedSettings):
         super().__post_init__()
         for meaning, rate in (("speed", self.max_speed), ("acceleration", self.acceleration)):
             if not rate * self.per_radian < MOST:
-                raise ValueError(f"{rate:g} rad is impossible as {meaning} of a stage")
+                raise ValueError(f"check the settings of the stage: {rate:g} rad is impossible as its {meaning}")
         if not -FARTHEST <= self.low < self.high <= FARTHEST:
             low, high = math.degrees(self.low), math.degrees(self.high)
             raise ValueError(

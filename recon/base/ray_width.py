@@ -14,7 +14,7 @@ class RayWidth(Checked):
     exposure. If `pixel`, `blur` and `arc` are all 0, a ray is a line.
 
     Attributes:
-        pixel: side, in pixels, of the square over which a pixel averages; 1: the area of the pixel itself.
+        pixel: side of the square over which the detector averages, divided by the pixel size; 1: the area of a pixel.
         blur: standard deviation in pixels of a Gaussian blur of the detector (scintillator, optics).
         arc: angle in radians by which the stage turns during an exposure. The angle of a projection is the angle at the
             middle of its exposure.

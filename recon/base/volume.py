@@ -55,9 +55,10 @@ class Grid:
         """The grid with one voxel per detector pixel: (rows, cols, cols) voxels around the rotation axis. The middle
         slice is at the height of the middle detector row.
 
-        If projections are shifted, not all of them see every position. The grid covers a position along the columns or
-        rows if at least half as many projections see it as see the position seen most often. Therefore small alignment
-        shifts do not change the grid, and the grid of a scan that steps up and down covers all heights.
+        If projections are shifted, not all of them see every position along the columns or rows. Let n be the largest
+        number of projections that see one position. The grid covers all positions that at least n / 2 projections see.
+        Therefore small alignment shifts do not change the grid, and the grid of a scan that steps up and down covers
+        all heights.
 
         If the axis is off the detector's middle (`Geometry.is_off_middle`), the box contains the field of view of a
         360° scan, as in `of_field`. With a smaller box, material that projections see outside the box would appear in

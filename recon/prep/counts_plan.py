@@ -51,11 +51,11 @@ class CorrectionSettings:
     `references.edge_depth`.
 
     Attributes:
-        floor: lowest transmission.
+        floor: smallest transmission; smaller ones are replaced by it.
         hot_threshold: limit in robust standard deviations; inf: no pixel is masked.
         zinger_threshold: limit in standard deviations; inf: no zinger is removed.
         air: number of columns (left, right) that see no sample in any projection, or "auto" to find them, or "none".
-        sample_from: limit of the line integral at the edges of the detector.
+        sample_from: line integral at the edges of the detector above which the edges show the sample, not air.
     """
 
     floor: float = 1e-4

@@ -263,7 +263,7 @@ class PnpDct(VoxelMethod):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """No settings: a time limit cannot end PnP-DCT, because its number of steps is fixed."""
+        """Empty: no setting of PnP-DCT depends on a time limit, because its number of steps is fixed."""
         return {}
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:

@@ -161,11 +161,10 @@ def _conclusions(table: TrialTable) -> list[str]:
         out.append(f"+{rise:.2f}{chance} dB for {price}: {after.trial.label}.")
     highest = max((o for o in table.compared if math.isfinite(o.quality(measure))), key=lambda o: o.quality(measure))
     if (gain := highest.quality(measure) - best.quality(measure)) >= LEAST_GAIN:
-        chance = (
-            f"+{gain:.2f} dB with {highest.trial.label}, but the difference may be chance (± "
-            f"{table.chance(highest, best):.2f} dB)."
+        out.append(
+            f"No trial is significantly better than {best.trial.label}. {highest.trial.label} has +{gain:.2f} dB, but "
+            f"the difference may be chance (± {table.chance(highest, best):.2f} dB)."
         )
-        out.append(f"No other trial is significantly better. The highest quality is {chance}")
     return out
 
 

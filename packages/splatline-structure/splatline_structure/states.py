@@ -117,8 +117,8 @@ def measure_states(paths: Sequence[Path], output: Path, answer: Answer, values: 
         if not fit.matches:
             answer.warn(
                 f"{path} shows another sample than {first}, or most of the sample has changed: at most 65 % of the "
-                "particles of the reference were found in this scan. The numbers of this state are not determined. "
-                "Check the files, or take a later state as the reference."
+                "particles of the reference were found in this scan, or their grey levels fell to less than half. The "
+                "numbers of this state are not determined. Check the files, or take a later state as the reference."
             )
     if not any(state.matches for state in states):
         raise DataError(
@@ -199,8 +199,8 @@ def _first_time(path: Path, record: Any, values: dict[str, Any]) -> float:
         pixel = source.pixel_size_mm
         if pixel is not None and not math.isclose(pixel * side, record.grid.voxel_size, rel_tol=_PITCH):
             raise DataError(
-                f"Reconstruct the reference with voxels as wide as the pixels of the states: {path} has pixels of "
-                f"{1e3 * pixel * side:.4g} µm (binned {side} times), but the reference has voxels of "
+                f"Reconstruct the reference with voxels as wide as the pixels of the state {path}. They are "
+                f"{1e3 * pixel * side:.4g} µm wide (binning {side} x {side}), but the reference has voxels of "
                 f"{1e3 * record.grid.voxel_size:.4g} µm. Nothing was written."
             )
         times = source.table.times

@@ -92,8 +92,8 @@ class Discrete(HalfVoxels):
             raise ValueError(f"levels must be two or more values in ascending order, got {self.levels}")
 
     def refit(self, share: float) -> VoxelMethod:
-        """The method of the refits for error bars: `EarlyTv`. It makes 16 iterations times `share`, because error bars
-        were calibrated with 16 iterations.
+        """The method of the refits for error bars: `EarlyTv`. It makes the fraction `share` of 16 iterations, because
+        error bars were calibrated with 16 iterations.
         """
         return EarlyTv(iterations=max(1, round(share * _REFIT_SWEEPS)), allow_negative=self.allow_negative)
 

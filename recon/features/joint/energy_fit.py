@@ -96,7 +96,7 @@ class EnergyViews:
 
     def parted(self, n: int) -> NDArray[np.intp]:
         """Divide the projections into n parts, so that each part has projections of all energies and directions. Return
-        the number of the part, 0 to n - 1, for each projection.
+        for each projection the part it belongs to, from 0 to n - 1.
 
         If there are more energies than projections in a part, neighbouring energies are treated as one energy.
         """

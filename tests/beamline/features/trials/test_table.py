@@ -48,8 +48,7 @@ def test_a_gain_within_the_scatter_of_the_views_is_none() -> None:
     slow, fast = [0.9, 1.1, 0.9, 1.1], [1.0, 1.0, 1.0, 1.02]
     table = _judged((1.0, [4.0, 4.1, 3.9, 4.0]), (2.0, fast), (9.0, [left * 0.99 for left in slow]))
     assert table.front == list(table.outcomes[:2])
-    said = "No other trial is significantly better. The highest quality is +0.07 dB with fbp, 12 views, but"
-    assert sentences(table)[-1].startswith(said)
+    assert "fbp, 12 views has +0.07 dB, but the difference may be chance" in sentences(table)[-1]
 
 
 def test_a_gain_in_every_view_is_one_however_much_views_differ() -> None:
