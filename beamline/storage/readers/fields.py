@@ -155,8 +155,8 @@ def _disagrees(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> b
 
 
 _ONE = (
-    "the value differs between projections, so the images differ in magnification (up to {:.2g} px at the edge of "
-    "the field of view), but one value is used for all. Scale the images about the rotation axis to one pixel size, or "
+    "the value differs between projections, so the images differ in size, by up to {:.2g} px at the edge of the "
+    "field of view, but one value is used for all. Scale the images about the rotation axis to one pixel size, or "
     "state the right pixel size with --pixel-size-um (cone beam: --cone)"
 )
 _POSES = "give the shifts of the projections with --poses"
