@@ -124,7 +124,7 @@ def ridden(loopback: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -
             _line(viewer, "ready")
         threading.Thread(target=_read, args=(viewers[0], ridden.by_viewer), daemon=True).start()
         running = stack.enter_context(_program(*scan, log=log / "scan.log"))
-        _until(lambda: len(ridden.by_p4p) > 3)
+        _until(lambda: len(ridden.by_p4p) > 30)  # the darks, the flats, and projections
         viewers[1].send_signal(signal.SIGSTOP)  # it stands still to the end
         for scheme in ("ca", "pva"):
             judge = (HERE / "bluesky_judge.py", f"{scheme}://T:DET:", ridden.files, 5)

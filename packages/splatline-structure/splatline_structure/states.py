@@ -199,9 +199,9 @@ def _first_time(path: Path, record: Any, values: dict[str, Any]) -> float:
         pixel = source.pixel_size_mm
         if pixel is not None and not math.isclose(pixel * side, record.grid.voxel_size, rel_tol=_PITCH):
             raise DataError(
-                f"Reconstruct the reference with voxels as wide as the pixels of the state {path}. They are "
-                f"{1e3 * pixel * side:.4g} µm wide (binning {side} x {side}), but the reference has voxels of "
-                f"{1e3 * record.grid.voxel_size:.4g} µm. Nothing was written."
+                f"{path}: the pixels are {1e3 * pixel * side:.4g} µm wide (binning {side} x {side}), but the reference "
+                f"has voxels of {1e3 * record.grid.voxel_size:.4g} µm. Reconstruct the reference with voxels as wide "
+                "as these pixels. Nothing was written."
             )
         times = source.table.times
         return math.nan if times is None else float(np.nanmin(times[source.table.views]))
