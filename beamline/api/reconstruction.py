@@ -172,8 +172,8 @@ def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
     scan file wait for each other, so that a slow reader slows the scan down.
 
     Args:
-        path: a scan file, or the folder of a run, from which the newest part is read. The scan file need not exist yet:
-            the function waits at most 120 s for it.
+        path: a scan file, or the folder of a run. Of a resumed run, only the newest part is read. The scan file need
+            not exist yet: the function waits at most 120 s for it.
         follow: False: only the frames that are already in the file.
 
     Raises:

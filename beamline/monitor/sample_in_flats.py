@@ -188,8 +188,8 @@ def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
         least_shown = LIGHTER * least
         yield BadFrames(flats, typical_mass, LIGHTER * least, (
             "the sample was in the beam. The differences between projections show that the sample absorbs at least "
-            f"{least:.2g} (line integral, mean over the frame). But the projections divided by these flats show only "
-            f"{typical_mass:.2g} (limit {least_shown:.2g})."
+            f"{least:.2g} (line integral, mean over the frame). But after the division by these flats, the projections "
+            f"show only {typical_mass:.2g} (expected: at least {least_shown:.2g})."
         ))  # fmt: skip
 
 

@@ -128,9 +128,9 @@ class AlarmReaction:
 
     def _act(self, flag: Flag) -> None:
         n = self._in_a_row[flag.check]
-        frames_have = f"{n} consecutive frames have" if n > 1 else "1 frame has"
+        frames = f"{n} consecutive frames" if n > 1 else "1 frame"
         advice = flag.advice.rstrip(".")
-        reason = f"{frames_have} an alarm of the check `{flag.check}` of the monitor: {advice}"
+        reason = f"the check `{flag.check}` of the monitor raised an alarm for {frames}: {advice}"
         match self._policies.get(flag.check, Policy.LOG):
             case Policy.WARN:
                 self._sink(Warned(f"{reason}."))

@@ -62,7 +62,8 @@ def placed_views(
     shifts_of_views = np.zeros((theta.size, 2)) if shifts is None else np.asarray(shifts, np.float64)
     if shifts_of_views.shape != (theta.size, 2) or not np.isfinite(shifts_of_views).all():
         raise ValueError(
-            f"shifts must be finite pixels (col, row) with shape [{theta.size}, 2], got shape {shifts_of_views.shape}"
+            f"shifts must be finite, in pixels (col, row), with shape [{theta.size}, 2], got shape "
+            f"{shifts_of_views.shape}"
         )
     roll, tilt = (_checked_turns(name, where.get(name, 0.0), theta.size) for name in ("roll", "tilt"))
     return {

@@ -162,9 +162,7 @@ class Grid:
         return z, y, x
 
     def part(self, z: slice, y: slice, x: slice) -> Grid:
-        """The part of this box that contains only the voxels [z, y, x]. Each of the three slices must have a start and
-        a stop.
-        """
+        """The part of this box in the slices z, y and x of its voxels. Each slice must have a start and a stop."""
         slices = (z, y, x)
         centre = tuple(
             first + (part.start + part.stop - 1) / 2 * edge

@@ -95,8 +95,8 @@ class R2(Fit):
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The residuals of the method's volume in the held-out projections.
 
-        Usually the test of the fit makes a quarter of the steps, and makes all steps only if a quarter does not decide
-        whether the fit is best, see `trial_fit.predict`. The test runs the whole method unchanged, with its stopping
+        The test makes a quarter of the steps of the fit. It makes all steps only if a quarter does not decide whether
+        the fit predicts best, see `trial_fit.predict`. The test runs the whole method unchanged, with its stopping
         rule and its voxel refinement, in these cases: `finish`, `seconds` or `early_stop` is set; the fit starts from
         given Gaussians; the trial could not choose a regularisation weight.
         """

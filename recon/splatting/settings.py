@@ -193,10 +193,10 @@ class FitSettings:
     square of the voxel size, so total variation does not move the centres. The correct gradient raises the PSNR of the
     walnut by 0.2 dB (60 projections) and that of the battery by 0.4 dB (90 projections).
 
-    The published learning rates are for 30 000 steps, and a fit of 1000 steps with them is far from convergence. If
-    all rates are multiplied by `pace` 20, with two projections per step and a low last rate, a fit of 1000 steps gains
-    1 to 4 dB. With rates 26 times the published ones and a higher last rate, 400 steps before the voxel refinement
-    suffice for a volume that needs 500 steps with `pace` 20.
+    The published learning rates are for 30 000 steps, and a fit of 1000 steps with them is far from convergence. With
+    `pace` 20 (all rates are 20 times the published ones), two projections per step and a low last rate, a fit of 1000
+    steps gains 1 to 4 dB. With rates 26 times the published ones and a higher last rate, 400 steps before the voxel
+    refinement suffice for a volume that needs 500 steps with `pace` 20.
 
     Attributes:
         loss: "l1" (published), "l2", or "poisson" (squares weighted by the transmission).

@@ -238,7 +238,10 @@ def _truth(scan: Scan, path: Path, binning: int | None, output: Output) -> dict[
     truth = truth_of(scan.scene.sample, scan.detector, n)
     write_truth(path, truth)
     voxels = " x ".join(map(str, truth.grid.shape))
-    output("truth", f"{path}  {voxels} voxels of {truth.grid.voxel_size:.4g} mm, for `beamline recon --bin {n}`")
+    output(
+        "truth",
+        f"{path}  {voxels} voxels of {truth.grid.voxel_size:.4g} mm, as in volumes of `beamline recon --bin {n}`",
+    )
     return {"truth": path}
 
 

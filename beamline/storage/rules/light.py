@@ -290,9 +290,9 @@ def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
         doubt = f"scaled to {usual:g} s" + (
             "."
             if flats_stated
-            else f". The exposure of the flats is not stated. {assumed_exposure:g} s is assumed, because no "
-            "projection is then brighter than the flats. If the sample fills the field of view, this exposure "
-            "may be wrong. All line integrals are then wrong by the same amount."
+            else f". The file does not state the exposure of the flats. The program assumes {assumed_exposure:g} s, "
+            "because with this exposure no projection is brighter than the flats. If the sample fills the field of "
+            "view, this exposure may be wrong. In that case all line integrals are wrong by the same amount."
         )
         yield Finding(
             "info" if flats_stated else "warning",

@@ -97,11 +97,11 @@ def pixels_measured(scan: ScanEvidence) -> Iterator[Finding]:
         return
     finite = np.abs(views, dtype=np.float64) <= LARGEST
     if not finite.any():
-        message = f"The projections checked have no finite pixel: all are NaN, infinite or beyond {LARGEST:g}."
+        message = f"The checked projections have no finite pixel: all are NaN, infinite or beyond {LARGEST:g}."
         yield Finding("error", "pixels", message)
     elif float(views[finite].min()) == float(views[finite].max()):
         value = views[finite][0]
-        yield Finding("error", "pixels", f"Every pixel of the projections checked is {value:g}.")
+        yield Finding("error", "pixels", f"In the checked projections, every pixel is {value:g}.")
     elif not finite.all():
         bad_share = 1 - finite.mean()
         yield Finding(

@@ -48,7 +48,7 @@ FAULTS = {
     "FA": Meaning("analogue encoder out of step", "Search the reference again; check the encoder's cable"),
     "FR": Meaning("overdrive limit", "Use a lower acceleration or load"),
     "FS": Meaning("stalled and stopped", "Find what blocks the stage; use a lower speed, acceleration or load"),
-    "FB": Meaning("stream bounds", "Find which program runs a stream on this controller"),
+    "FB": Meaning("stream bounds", "Find which program runs a stream (a queue of moves) on this controller"),
     "FP": Meaning("left its path", "Find which program runs an interpolated move on this controller"),
     "FE": Meaning("limit error", "Find why the stage ran into a limit, then search the reference"),
     "FT": Meaning("twisted too far", "Turn the stage back until the cables are straight"),

@@ -295,8 +295,8 @@ class RiddenFrames:
         reason = self._measurement.pause.reason
         if reason and reason != self._reported_pause:
             self._warn(
-                "The scan continues without a pause, because another program runs it. The reason for a pause: "
-                f"{reason}."
+                f"There is a reason to pause the scan: {reason}. But the scan continues, because another program runs "
+                "it."
             )
         self._reported_pause = reason
         self._measurement.pause.resume()

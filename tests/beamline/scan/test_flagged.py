@@ -55,7 +55,7 @@ def test_a_policy_is_carried_out_after_so_many_frames_in_a_row(
     assert len(events) == acts * (policy is Policy.WARN)
     for text in [data["message"] for _, data in events] + [stop.reason] * stop.stopping:
         assert (
-            text.startswith("3 consecutive frames have an alarm of the check `beam` of the monitor: Look at the beam")
+            text.startswith("the check `beam` of the monitor raised an alarm for 3 consecutive frames: Look at the beam")
             or acts > 1
         )
 
@@ -82,7 +82,7 @@ def test_an_alarm_pauses_a_scan_with_a_closed_shutter_until_it_is_resumed(
     ran = Ran(tmp_path, instrument, *WORDS, "monitor.policy.stuck=pause", f"scan.mode={mode}", heard=resume)
     assert ran.result.n_frames == 47
     ((message, was_open),) = paused
-    assert "closed shutter: 2 consecutive frames have an alarm of the check `stuck` of the monitor" in message
+    assert "closed shutter: the check `stuck` of the monitor raised an alarm for 2 consecutive frames" in message
     assert "use `beamline resume` to continue" in message
     assert not was_open
     on = [State.TAXI, State.ACQUIRING] if mode == "fly" else [State.ACQUIRING]
@@ -102,7 +102,7 @@ def test_the_policy_stop_ends_the_scan_cleanly(tmp_path: Path, monkeypatch: pyte
     words = (*WORDS, "monitor.policy.stuck=stop", "scan.mode=step")
     ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9, 10})), *words)
     assert type(ran.error) is ScanStopped
-    assert "2 consecutive frames have an alarm of the check `stuck` of the monitor" in str(ran.error)
+    assert "the check `stuck` of the monitor raised an alarm for 2 consecutive frames" in str(ran.error)
     n = ran.of("scan_done")[0].data["n_frames"]
     assert 11 <= n < 20
     ran.assert_safe()
