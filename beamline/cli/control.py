@@ -135,8 +135,8 @@ stop = _command(
     "stop",
     "Stop a running scan cleanly, from another terminal, as the first Ctrl-C does.\n\n\b\n"
     "beamline stop        the only running scan in ./runs\nbeamline stop RUN    the scan in the folder RUN\n\n"
-    "The scan still stores the frames that are already triggered, takes the remaining darks and flats, and returns the "
-    "stage. `beamline scan --resume RUN` continues the run later.",
+    "The scan still stores the frames that are already triggered, takes darks or flats if it has none yet, and returns "
+    "the stage. `beamline scan --resume RUN` continues the run later.",
 )
 abort = _command(
     "abort",

@@ -131,7 +131,7 @@ class _Keeper:
             if not restarts_left:
                 self._sink(
                     Warned(
-                        f"The second watchdog has ended, too (code {code}): if the scan is killed now, the shutter "
+                        f"The last watchdog has ended, too (code {code}): if the scan is killed now, the shutter "
                         "stays open."
                     )
                 )
