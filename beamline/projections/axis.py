@@ -105,8 +105,8 @@ def _axis_by_views(
     warn: Warn,
     progress: Callable[[int, int], None],
 ) -> tuple[float, AxisEstimate | None]:
-    """The axis found with held-out projections. The axis of the file is kept unless the held-out projections agree
-    better with another axis.
+    """The axis found with held-out projections. The axis of the file is kept unless the held-out projections show
+    another axis clearly.
     """
     source, stated, cols = scan.source, scan.source.axis_col, scan.source.shape[1]
     if scan.selection.axis_rows is not None:

@@ -64,8 +64,8 @@ class MaterialTrial:
 
     Attributes:
         smooth: residuals [view] with total variation alone.
-        best, materials: smallest residuals, and the levels of that volume. If no levels predict significantly better:
-            the residuals with total variation, and None.
+        best, materials: smallest residuals, and the levels of that volume. If no levels pass all tests: the
+            residuals with total variation, and a `MaterialPrior` without levels.
     """
 
     def __init__(self, trial: Trial, weight: float, sweeps: int, levels: Sequence[float] | None) -> None:

@@ -1,4 +1,4 @@
-"""The published R²-Gaussian fit (`r2-published`). Trade-offs leave it out, because its 30 000 steps take hours."""
+"""The published R²-Gaussian fit (`r2-published`). Trade-offs leave it out, because its 30 000 steps take long."""
 
 from recon.base.registry import Lengths, MethodEntry
 
