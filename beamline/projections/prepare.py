@@ -207,8 +207,8 @@ def _after_scan_steps(scan: SelectedScan, prepared: PreparedProjections, phases:
 
 
 def _with_unknown_filled(prepared: PreparedProjections) -> PreparedProjections:
-    """Interpolate rays with weight 0 (see `ray_weights`), projection by projection and in place, in the same way as
-    pixels that are `masked` in all projections.
+    """Interpolate rays with weight 0 (see `_ray_factors` of `PreparedProjections`), projection by projection and in
+    place, in the same way as pixels that are `masked` in all projections.
     """
     data, geometry = prepared.seen.data, prepared.geometry
     rays = seen_rays(geometry, Grid.matching(geometry)) if prepared.leaves_slices else None

@@ -307,7 +307,7 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
 
 
 def write_poses(path: Path, volume: Path) -> tuple[int, float]:
-    """Write the poses of the projections of a volume file as a CSV that `read_poses` reads; Returns the number of
+    """Write the poses of the projections of a volume file as a CSV that `read_poses` reads. Returns the number of
     projections, and the column of the rotation axis.
 
     Raises:

@@ -77,7 +77,7 @@ class ReconRecord:
         displacement: float32 [3, z, y, x] along z, y, x in `length_unit`: position of a point in the reference minus
             its position in the volume; None: no reference was used.
         kind: the quantity of the voxels.
-        model: the Gaussians behind the volume and the geometry of their projections (`result.arrays_of_model`); empty:
+        model: the Gaussians behind the volume and the geometry of their projections (`record.arrays_of_model`); empty:
             there is no model.
         compared: figures of merit of FBP from the same projections; None: not computed. This attribute and the
             following ones exist only for a volume that was just reconstructed; files do not contain them.

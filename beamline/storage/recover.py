@@ -49,10 +49,10 @@ class Recovered:
         dropped: number of frames at the end that were not committed when the process was killed. They are removed.
         missing: number of projections that were planned or chosen but not taken; None if the file does not contain its
             plan, and for a later part of a run.
-        lost: number of frames that were committed but did not reach the disk, and of all frames after them. They are
+        lost: rows of the frames that were committed but did not reach the disk, and of all frames after them. They are
             removed.
-        damaged: number of frames whose pixels differ from their checksum. They are kept.
-        altered: number of frames whose row in the log differs from its checksum. They are kept.
+        damaged: rows of the frames whose pixels differ from their checksum. They are kept.
+        altered: rows of the frames whose row in the log differs from its checksum. They are kept.
         remark: a step that failed although the frames are complete; "" if no step failed.
     """
 

@@ -143,7 +143,7 @@ class CoarseViews:
 
 
 def coarse_views(scan: ScanEvidence) -> CoarseViews | None:
-    """The coarse projections of a scan. Empty if there are too few projections, or if their line integrals are
+    """The coarse projections of a scan. None if there are too few projections, or if their line integrals are
     unknown.
     """
     views = scan.table.views_with_angles

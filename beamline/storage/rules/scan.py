@@ -242,7 +242,7 @@ BEFORE_VIEWS: tuple[Rule, ...] = (quantity_stated, references_present, numbers_w
 
 
 def findings_of(scan: ScanEvidence, rules: tuple[Rule, ...] = RULES) -> list[Finding]:
-    """Yields the findings of these rules on a scan. If a rule would take too long, a finding says that it was not
+    """The findings of these rules on a scan. If a rule would take too long, a finding says that it was not
     applied.
     """
     findings = list[Finding]()
