@@ -17,7 +17,7 @@ from recon.base.setting import NonNegative
 from recon.base.volume import Grid
 from recon.methods import CANDIDATES, by_name
 from recon.voxels.choice import LEAST_GAIN, TrialChoice
-from recon.voxels.half_voxels import with_halves
+from recon.voxels.half_voxels import HalfVoxels, with_halves
 from recon.voxels.held_out import LEAST_VIEWS
 from recon.voxels.iterative import VoxelMethod, scaled_problem, threads_for, watched
 from recon.voxels.projector import Projector
@@ -118,7 +118,18 @@ class Auto(Method):
             return TrialChoice("stopped before the choice"), None
         if choice.chosen is None:
             raise ValueError("; ".join(each.remark for each in choice.predictions))
-        return choice, trial
+        return self._with_half_voxels(choice, problem, trial), trial
+
+    def _with_half_voxels(self, choice: TrialChoice, problem: ReconProblem, trial: Trial) -> TrialChoice:
+        """The choice, with the result of the test of half voxels if the chosen candidate would use them."""
+        assert choice.chosen is not None
+        chosen, prior = self.candidates[choice.chosen], choice.prior
+        if prior is None or not isinstance(chosen, HalfVoxels) or not chosen.halves(problem.geometry, problem.grid):
+            return choice
+        units, weighed = trial.problem.units, trial.problem.weight is not None
+        with threads_for(problem.grid):
+            wanted = chosen.predicts_in_halves(trial, units.prior(prior, weighed))
+        return choice.with_prior(prior._replace(half_voxels=wanted))
 
     @property
     def alternatives(self) -> tuple[Method, ...]:

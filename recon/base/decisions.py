@@ -43,18 +43,20 @@ class Prior(NamedTuple):
         strength: last threshold of the patch-based denoiser (PnP-DCT); 0: PnP-DCT was not tried.
         patches: PnP-DCT predicts held-out projections better than total variation alone.
         materials: discrete levels that voxels are pulled to; None: levels were not searched for.
+        half_voxels: half voxels predict held-out projections as well as whole voxels; None: not tested.
     """
 
     weight: float
     strength: float = 0.0
     patches: bool = False
     materials: MaterialPrior | None = None
+    half_voxels: bool | None = None
 
     @classmethod
     def of(cls, values: Sequence[Any]) -> Prior:
         """A prior, or its values from a file."""
-        weight, strength, patches, materials = values
-        return cls(weight, strength, patches, materials and MaterialPrior(*materials))
+        weight, strength, patches, materials, *half_voxels = values  # without the last value in earlier versions
+        return cls(weight, strength, patches, materials and MaterialPrior(*materials), *half_voxels)
 
 
 class IterationEnd(NamedTuple):

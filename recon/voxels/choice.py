@@ -191,6 +191,13 @@ class TrialChoice(NamedTuple):
         """The prior of the chosen candidate."""
         return None if self.chosen is None else self.predictions[self.chosen].prior
 
+    def with_prior(self, prior: Prior) -> TrialChoice:
+        """The choice with another prior of the chosen candidate."""
+        assert self.chosen is not None
+        predictions = list(self.predictions)
+        predictions[self.chosen] = predictions[self.chosen]._replace(prior=prior)
+        return self._replace(predictions=tuple(predictions))
+
     @property
     def reason(self) -> str:
         """The part of the scan, all residuals, the remarks, and why a simpler candidate than the best was chosen.

@@ -15,6 +15,7 @@ as the field of view gain 0.1 to 0.4 dB with total variation, and 0.5 to 0.8 dB 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar, Self, TypeVar
@@ -23,13 +24,16 @@ import numpy as np
 
 from recon.base.arrays import F32
 from recon.base.choices import Quality
+from recon.base.decisions import Prior
+from recon.base.empirical import ONE_IN, STILL_IN_TRIAL
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.iterative import VoxelMethod
 from recon.voxels.ordered_fista import Prox, Pull, Subsets, ordered_fista, subsets_of
 from recon.voxels.priors import TvWeight, tv_prox
 from recon.voxels.resolution import smoothed
-from recon.voxels.standstill import USUAL_SWEEPS, with_quality
+from recon.voxels.standstill import MOST_SWEEPS, USUAL_SWEEPS, with_quality
+from recon.voxels.trial import TV_STEPS, Trial
 from recon.voxels.voxel_problem import VoxelProblem, bytes_of
 
 MethodT = TypeVar("MethodT")
@@ -61,6 +65,16 @@ and 0.4 dB if levels are not rejected; `auto` takes other methods for most of th
 _MOST_COLUMNS, _WIDEST, _LEAST_WIDTH, _AS_WIDE = 1024, 2.2, 0.75, 0.1
 # copies of half-voxel volumes: a quarter for the volume of whole voxels, the rest for the coarse cells of damping
 _MORE_VOLUMES = 0.6
+HALVES = "half_voxels"
+"""Name of the decision whether half voxels predict held-out projections as well as whole voxels."""
+_LARGEST_LOSS = 0.004
+"""Share by which the residual of half voxels in held-out projections may be larger.
+
+In scans of nine objects (30 to 90 projections of 64 and 128 columns), half voxels that lose more than 0.1 dB have a
+residual that is larger by 0.4 to 8 %; those that gain more than 0.2 dB have a residual that is smaller, or larger by at
+most 0.3 %. (docs/decisions/voxels.md has the table.) The test reconstruction must converge: after 6 iterations, its
+residual does not tell the two apart.
+"""
 BY_QUALITY: dict[Quality, bool | None] = {"preview": False, "standard": None, "best": True}
 """Whether the last iterations use half voxels, for each preset; None: see `uses_half_voxels`."""
 
@@ -70,7 +84,8 @@ class HalfVoxels(VoxelMethod):
 
     Attributes:
         still: as in `FistaTv`.
-        half_voxels: True or False: always or never; None: see `uses_half_voxels`.
+        half_voxels: False: never; True: with any number of projections; None: see `uses_half_voxels`. If held-out
+            projections show that half voxels predict worse than whole voxels, they are not used.
         few: as in `uses_half_voxels`.
         to_the_end: False: a fixed number of iterations, on whole voxels.
     """
@@ -108,11 +123,35 @@ class HalfVoxels(VoxelMethod):
         on_halves = replace(self.buffers, volumes=self.buffers.volumes + _MORE_VOLUMES, filtered=False)
         return max(whole, bytes_of(on_halves, geometry, halved(grid), weighted))
 
+    def predicts_in_halves(self, trial: Trial, prior: Prior) -> bool:
+        """Whether half voxels predict the held-out projections of a trial as well as whole voxels.
+
+        Args:
+            prior: the prior of the volume, in the units of the trial.
+        """
+        weight = prior.weight / math.sqrt(ONE_IN / (ONE_IN - 1))  # see `choose_weight`
+        whole = trial.volume_of_weight(weight) if trial.smooth is None else trial.smooth
+        return halves_predict(trial, whole, weight)
+
+    def uses_halves(self, problem: VoxelProblem, prior: Prior, trial: Callable[[], Trial | None]) -> bool:
+        """Whether the last iterations of the volume use half voxels: `halves`, and `predicts_in_halves`.
+
+        If the prior was chosen before, or if no projections can be held out, nothing more is tested.
+        """
+
+        def decided() -> bool:
+            if problem.prior is not None:
+                return problem.prior.half_voxels is not False
+            judge = trial()
+            return judge is None or self.predicts_in_halves(judge, prior)
+
+        projector = problem.projector
+        return self.halves(projector.geometry, projector.grid) and problem.decide(HALVES, decided)
+
     def in_half_voxels(
         self, problem: VoxelProblem, x: F32, mu: float, tv_steps: int, pull: MakePull | None = None, first: int = 0
     ) -> F32:
-        """The volume x [y, x, z] after further iterations on half voxels; x itself if `halves` says that there are
-        none.
+        """The volume x [y, x, z] after further iterations on half voxels.
 
         Args:
             x: the volume of whole voxels.
@@ -121,9 +160,7 @@ class HalfVoxels(VoxelMethod):
             pull: as in `on_half_voxels`.
             first: number of planned iterations before those that made x, for the progress.
         """
-        projector, decide = problem.projector, problem.decide
-        if not self.halves(projector.geometry, projector.grid):
-            return x
+        decide = problem.decide
         sweeps_before = 0 if decide.ended is None else decide.ended.after
         x = on_half_voxels(
             problem, x, mu, lambda fine: tv_prox(fine, DUAL_STEPS * tv_steps), done=first + sweeps_before,
@@ -163,6 +200,24 @@ def uses_half_voxels(wanted: bool | None, geometry: Geometry, grid: Grid, few: f
         return False
     are_few = geometry.n_views < few * own and columns <= min(_MOST_COLUMNS, _WIDEST * own)
     return wanted is True or (are_few and abs(width - 1) < _AS_WIDE and not geometry.is_cone)
+
+
+def halves_predict(trial: Trial, whole: F32, mu: float, pull: MakePull | None = None) -> bool:
+    """Whether half voxels predict the held-out projections of a trial as well as whole voxels.
+
+    Args:
+        whole: the volume [y, x, z] of whole voxels from the projections that are not held out.
+        mu, pull: weight μ of total variation in that volume, and its pull; see `on_half_voxels`.
+    """
+
+    def on_halves(part: VoxelProblem, x: F32) -> F32:
+        return on_half_voxels(
+            part, x, mu, lambda fine: tv_prox(fine, DUAL_STEPS * TV_STEPS), done=0, sweeps=MOST_SWEEPS,
+            still=STILL_IN_TRIAL, pull=pull,
+        )  # fmt: skip
+
+    residuals = trial.residuals(trial.volume_by(on_halves, whole))
+    return not residuals.mean() > (1 + _LARGEST_LOSS) * trial.residuals(whole).mean()
 
 
 def on_half_voxels(

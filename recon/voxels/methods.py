@@ -100,8 +100,14 @@ class FistaTv(HalfVoxels):
         return trial.prediction(self.name, trial.residuals_of_weight(trial.weight), Prior(trial.weight))
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        x, weight = self.with_weight(problem, x)
-        return self.in_half_voxels(problem, x, weight.value, self.tv_steps) if problem.go_on.going else x
+        if not self.halves(problem.projector.geometry, problem.projector.grid):
+            return self.with_weight(problem, x)[0]
+        trial = cache(partial(Trial.of, problem))
+        x, weight = self.with_weight(problem, x, trial)
+        if not problem.go_on.going or not self.uses_halves(problem, Prior(weight.value), trial):
+            return x
+        trial.cache_clear()
+        return self.in_half_voxels(problem, x, weight.value, self.tv_steps)
 
     def with_weight(
         self, problem: VoxelProblem, x: F32, trial: Callable[[], Trial | None] | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from recon.features.discrete.mixture import (
     thin_parts,
 )
 from recon.voxels.choice import LEAST_GAIN, significantly_better
+from recon.voxels.half_voxels import halves_predict
 from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem
 
@@ -146,6 +148,11 @@ class MaterialTrial:
         if significantly_better(best, self.smooth, LEAST_GAIN) or self._is_better(fewer):
             return best, fewer
         return None
+
+    def predicts_in_halves(self, materials: MaterialPrior) -> bool:
+        """Whether half voxels with these levels predict held-out projections as well as whole voxels."""
+        whole = self._volume_by(pull_to(materials, self._trial.problem, self._start))
+        return halves_predict(self._trial, whole, self._weight * materials.tv_share, partial(pull_to, materials))
 
     def _is_better(self, materials: MaterialPrior) -> bool:
         """Whether a volume as it will be made with these levels predicts better than total variation."""

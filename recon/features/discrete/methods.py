@@ -167,17 +167,27 @@ class Discrete(HalfVoxels):
         if not problem.go_on.going:
             return x
         if materials is None:
+            if not without_levels.uses_halves(problem, Prior(mu), trial):
+                return x
             return without_levels.in_half_voxels(problem, x, mu, TV_STEPS)
         sweeps_before = 0 if problem.decide.ended is None else problem.decide.ended.after
         x = self.pulled(problem, x, weight, materials, self.first_sweeps)
         if (ended := problem.decide.ended) is not None:
             problem.decide.ended = ended._replace(after=sweeps_before + ended.after)
-        if not problem.go_on.going:
+        if not problem.go_on.going or not self.uses_halves(problem, Prior(mu, materials=materials), trial):
             return x
         pull = partial(pull_to, materials)
         return self.in_half_voxels(
             problem, x, mu * materials.tv_share, TV_STEPS, pull, self.first_sweeps - sweeps_before
         )
+
+    def predicts_in_halves(self, trial: Trial, prior: Prior) -> bool:
+        """Whether half voxels predict held-out projections as well as whole voxels, with these levels if there are
+        any."""
+        materials = prior.materials
+        if materials is None or not materials.levels:
+            return super().predicts_in_halves(trial, prior)
+        return MaterialTrial(trial, prior.weight, self.iterations, materials.levels).predicts_in_halves(materials)
 
     def materials(
         self, problem: VoxelProblem, weight: TvWeight, trial: Callable[[], Trial | None]

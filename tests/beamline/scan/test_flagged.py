@@ -55,7 +55,9 @@ def test_a_policy_is_carried_out_after_so_many_frames_in_a_row(
     assert len(events) == acts * (policy is Policy.WARN)
     for text in [data["message"] for _, data in events] + [stop.reason] * stop.stopping:
         assert (
-            text.startswith("the check `beam` of the monitor raised an alarm for 3 consecutive frames: Look at the beam")
+            text.startswith(
+                "the check `beam` of the monitor raised an alarm for 3 consecutive frames: Look at the beam"
+            )
             or acts > 1
         )
 

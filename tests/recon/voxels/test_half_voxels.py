@@ -10,15 +10,23 @@ import pytest
 
 import recon
 from recon.base.choices import Quality
-from recon.base.decisions import Decisions, GoesOn
+from recon.base.decisions import Decisions, GoesOn, Prior
 from recon.base.geometry import Geometry
 from recon.base.method import Progress, ReconProblem, RunControl
 from recon.base.view_data import Views
-from recon.base.volume import Grid
+from recon.base.volume import Grid, Volume
 from recon.error_bars import error_bars_memory
 from recon.kernels.cpu.tv import total_variation
 from recon.voxels.choice import TrialChoice
-from recon.voxels.half_voxels import COST, HalfVoxels, halved, uses_half_voxels, with_halves
+from recon.voxels.half_voxels import (
+    COST,
+    HALVES,
+    HalfVoxels,
+    halved,
+    halves_predict,
+    uses_half_voxels,
+    with_halves,
+)
 from recon.voxels.iterative import scaled_problem
 from recon.voxels.projector import Projector
 from recon.voxels.trial import Trial
@@ -154,6 +162,51 @@ def test_the_record_says_how_many_iterations_used_them() -> None:
     assert result.volume.data.shape == (ROWS, SIDE, SIDE)
 
 
+def trial_of(views: np.ndarray, geometry: Geometry) -> Trial:
+    projector = Projector(geometry, Grid.matching(geometry))
+    scan, _ = scaled_problem(projector, Views(views, geometry), None, True, GoesOn(), Decisions())
+    trial = Trial.of(scan)
+    assert trial is not None
+    return trial
+
+
+def test_they_are_rejected_if_whole_voxels_predict_better() -> None:
+    """Projections computed from whole voxels are predicted exactly by these voxels, and less well by half voxels."""
+    geometry = geometry_of(20)
+    volume = np.repeat(truth()[None], ROWS, 0).astype(np.float32)
+    exact = trial_of(recon.Projector(geometry, Grid.matching(geometry)).forward(volume), geometry)
+    assert not halves_predict(exact, exact.lines_of(Volume(volume, Grid.matching(geometry))), 1e-3)
+    noisy = np.random.default_rng(1).normal(exact_views(geometry), 0.01).astype(np.float32)
+    trial = trial_of(noisy, geometry)
+    assert trial.weight is not None
+    assert recon.FistaTv().predicts_in_halves(trial, Prior(trial.weight))
+
+
+@pytest.mark.parametrize("method", [recon.FistaTv(), recon.Discrete(), recon.Auto()])
+def test_the_decision_is_made_once_and_followed(method: recon.FistaTv | recon.Discrete | recon.Auto) -> None:
+    geometry, decide = geometry_of(20), Decisions()
+    views = np.random.default_rng(1).normal(exact_views(geometry), 0.01).astype(np.float32)
+    used = recon.reconstruct(views, geometry, method, control=RunControl(decide=decide))
+    assert decide.made[HALVES] == [True] and used.settings["half_voxel_iterations"] > 0
+    control = RunControl(decide=Decisions(0, {**decide.made, HALVES: [False]}))
+    assert "half_voxel_iterations" not in recon.reconstruct(views, geometry, method, control=control).settings
+
+
+def test_auto_tests_them_for_the_method_that_it_chose() -> None:
+    geometry = geometry_of(20)
+    views = np.random.default_rng(1).normal(exact_views(geometry), 0.01).astype(np.float32)
+    problem = ReconProblem(Views(views, geometry), Grid.matching(geometry))
+    choice = recon.Auto().choose(problem, RunControl())
+    assert choice.prior is not None and choice.prior.half_voxels is True
+    never = recon.Auto().with_quality("preview", 0).choose(problem, RunControl())
+    assert never.prior is not None and never.prior.half_voxels is None
+
+
+def test_a_prior_of_an_earlier_version_has_no_test_of_them() -> None:
+    assert Prior.of((0.5, 0.0, False, None)) == Prior(0.5)
+    assert Prior.of((0.5, 0.0, False, None, False)) == Prior(0.5, half_voxels=False)
+
+
 def test_a_stop_leaves_them_out() -> None:
     geometry, seen = geometry_of(20), list[Progress]()
     problem = ReconProblem(Views(exact_views(geometry), geometry), Grid.matching(geometry))
@@ -208,11 +261,7 @@ def test_what_never_uses_half_voxels_states_the_memory_of_whole_ones() -> None:
 
 def test_a_trial_with_a_given_weight_compares_whole_voxels() -> None:
     geometry = geometry_of(20)
-    projector = Projector(geometry, Grid.matching(geometry))
-    views = Views(exact_views(geometry), geometry)
-    scan, _ = scaled_problem(projector, views, None, True, GoesOn(), Decisions())
-    trial = Trial.of(scan)
-    assert trial is not None
+    trial = trial_of(exact_views(geometry), geometry)
     left = [
         recon.FistaTv(tv_weight=1e-3, half_voxels=wanted).predict(trial, TrialChoice("")).residuals
         for wanted in (False, True)
