@@ -38,7 +38,7 @@ _VECTORS = {
 }
 # names of arrays of vectors, and whether the vectors are those of a cone beam
 _ARRAYS = {"parallel3d_vec": False, "cone_vec": True}
-_STEEPEST = 85.0  # smallest tilt in degrees with which a row shows several slices
+_STEEPEST = 85.0  # largest tilt in degrees that is accepted
 _LARGEST = 64 * 2**20  # largest size of a CSV in bytes
 _HOW = (
     "state the directions: --poses FILE:x,-y means that a positive x_translation shifts the sample towards higher "
