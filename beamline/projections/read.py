@@ -27,7 +27,7 @@ from beamline.storage.rules.evidence import ScanEvidence
 from recon.prep.projections import Projections
 from recon.prep.references import References
 
-BATCH_BYTES = 64 * 2**20  # number of raw pixels that are read together
+BATCH_BYTES = 64 * 2**20  # bytes of raw pixels that are read together
 
 
 def read_binned(

@@ -34,7 +34,8 @@ _VOXELS, _VIEWS = 2**20, 180  # upper limits of the size of the volume that show
 _RIMS = 6.0, 1.5
 _COPIES = 6  # number of float32 copies of the volume
 _TERMS, _SUMS = 40, 800  # number of float64 values per binned pixel, and per projection
-_AT_ONCE, _NOISE_VIEWS = 64, 16  # fewest projections
+_AT_ONCE = 64  # fewest projections that are projected together, if there are so many
+_NOISE_VIEWS = 16  # most projections from which the noise is measured
 _LEAST_VIEWS, _WIDEST_GAP = 12, np.radians(30)
 
 Columns = Literal["none", "auto"] | tuple[int, int]

@@ -21,7 +21,7 @@ VIEWS = 32  # number of projections, from the whole scan, that are compared with
 # fraction of the brightest projections' intensity that the bright part of every projection exceeds, because the sample
 # does not cover the whole frame
 LEAST = 0.01
-_SUSPECT = 0.1  # share of the flats' intensity: a brighter projection is not examined more closely
+_SUSPECT = 0.1  # share of the scan's brightest projections: a brighter projection is not examined more closely
 _ACROSS = 32  # approximate number of pixels along each side in which a projection is first checked
 _TAIL = 1.2816  # standard deviations of the noise: BRIGHT percent of the noise are below
 

@@ -16,7 +16,7 @@ from recon.prep.unmeasured import with_borders_filled
 
 _TURNED = 12  # projections from which the direction of the axis is determined
 _LEAST = 8  # fewest projections, rows and columns from which it can be determined
-_LEAST_SQUARE = 16  # most projections and rows that are used
+_LEAST_SQUARE = 16  # fewest projections, if there are as many rows, with which sinograms are recognised
 # limits: a share of a change; a factor on the remaining change; a factor on a variance
 _ON_A_SINE, _OFF_A_SINE, _OTHER_MASS = 0.9, 4.0, 4.0
 # change of the row sums relative to that of the column sums; real scans have 0.001 to 0.03, rotated images the inverse
