@@ -22,7 +22,7 @@ from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
-from recon.base.arrays import F32
+from recon.base.arrays import F32, F64
 from recon.base.choices import Quality
 from recon.base.decisions import Prior
 from recon.base.empirical import ONE_IN, STILL_IN_TRIAL
@@ -217,7 +217,15 @@ def halves_predict(trial: Trial, whole: F32, mu: float, pull: MakePull | None = 
         )  # fmt: skip
 
     residuals = trial.residuals(trial.volume_by(on_halves, whole))
-    return not residuals.mean() > (1 + _LARGEST_LOSS) * trial.residuals(whole).mean()
+    return predict_as_well_as(residuals, trial.residuals(whole), _LARGEST_LOSS)
+
+
+def predict_as_well_as(halves: F64, whole: F64, largest_loss: float) -> bool:
+    """Whether the residuals [held-out view] of half voxels exceed those of whole voxels by at most this share.
+
+    True if the tests were stopped.
+    """
+    return not halves.mean() > (1 + largest_loss) * whole.mean()
 
 
 def on_half_voxels(

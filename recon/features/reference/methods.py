@@ -60,8 +60,9 @@ class FromReference(Method):
     Attributes:
         reference: the earlier volume, in 1/mm, in the coordinates of its own scan; None: there is no reference.
         otherwise: the method that is used if the reference is not.
-        half_voxels: whether the last iterations use half voxels; None: see `uses_half_voxels`, with as many projections
-            as columns as the limit.
+        half_voxels: False: never; True: with any number of projections; None: see `uses_half_voxels`, with as many
+            projections as columns as the limit. If held-out projections show that half voxels predict worse than whole
+            voxels, they are not used.
     """
 
     name: ClassVar[str] = "from-reference"
@@ -95,7 +96,8 @@ class FromReference(Method):
             return choice
 
         choice = TrialChoice.of(decide("method", compared))
-        verdict = ReferenceVerdict.of(decide("reference", lambda: self._asked(choice, trials)))
+        halves = uses_half_voxels(self.half_voxels, problem.geometry, problem.grid, _FEW)
+        verdict = ReferenceVerdict.of(decide("reference", lambda: self._asked(choice, trials, halves)))
         if verdict.used and (of_reference := self._from_reference(verdict, problem, control)) is not None:
             return of_reference
         because = verdict.because
@@ -106,13 +108,13 @@ class FromReference(Method):
         settings = {**result.settings, "reference_used": False, "reference_because": because}
         return replace(result, settings=settings, chosen=f"The reference was not used: {because}. {result.chosen}")
 
-    def _asked(self, choice: TrialChoice, trials: list[Trial | None]) -> ReferenceVerdict:
+    def _asked(self, choice: TrialChoice, trials: list[Trial | None], halves: bool) -> ReferenceVerdict:
         trial = trials[0] if trials else None
         if trial is None or trial.settings.all_rows:
             return ReferenceVerdict(False, f"whether it helps cannot be tested ({choice.part_of_scan})")
         if self.reference is None:
             return ReferenceVerdict(False, "none was given")
-        return asked(trial, choice, self.reference)
+        return asked(trial, choice, self.reference, halves)
 
     def _from_reference(
         self, verdict: ReferenceVerdict, problem: ReconProblem, control: RunControl
@@ -120,7 +122,8 @@ class FromReference(Method):
         """The volume with the reference; None: this part of a volume is where the reference shows no material."""
         assert self.reference is not None and control.decide is not None
         begin, history = control.now(), list[Progress]()
-        halves = uses_half_voxels(self.half_voxels, problem.geometry, problem.grid, _FEW)
+        wanted = uses_half_voxels(self.half_voxels, problem.geometry, problem.grid, _FEW)
+        halves = wanted and verdict.halves_predict
         planned = (1 + len(_ROUNDS)) * _FIRST_ITERATIONS + (_SHARPENING_ROUNDS + COST * halves) * _LAST_ITERATIONS
 
         def report(iteration: int, residual: float) -> None:
