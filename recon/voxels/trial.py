@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
-from recon.base.decisions import Decisions, GoesOn, Prior
+from recon.base.decisions import Decisions, GoesOn, MaterialPrior, Prior
 from recon.base.empirical import FIRST_THRESHOLD, ONE_IN, STILL_IN_TRIAL
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Method, ReconProblem, RunControl
@@ -164,6 +165,23 @@ class Predicting(Protocol):
         """The prediction of the method's volume. `so_far` contains the predictions of simpler candidates."""
 
 
+def _with_rows(problem: VoxelProblem, rows: slice) -> VoxelProblem:
+    """The problem with only these rows, which show slices."""
+    views, box = slab_of(problem.projector.geometry, problem.projector.grid, rows.start, rows.stop)
+    all_columns = problem.with_all_columns
+
+    def cut(rays: F32 | None) -> F32 | None:
+        return None if rays is None else np.ascontiguousarray(rays[:, :, rows])
+
+    data = cut(problem.data)
+    assert data is not None
+    return replace(
+        problem, projector=replace(problem.projector, geometry=views, grid=box), data=data, weight=cut(problem.weight),
+        measured=cut(problem.measured), _norms=[],
+        with_all_columns=None if all_columns is None else lambda: _with_rows(all_columns(), rows),
+    )  # fmt: skip
+
+
 class AllColumns(NamedTuple):
     """The rows of a trial with all columns, including air, because a fit of narrower projections is worse.
 
@@ -192,6 +210,7 @@ class Trial:
             because its rows keep their heights.
         smooth: the volume of total variation that predicts the held-out projections best so far.
         settings: settings of the run to which the trial belongs.
+        as_made: the last volume that was made with these discrete levels and all settings of the final volume.
     """
 
     def __init__(
@@ -208,6 +227,7 @@ class Trial:
         self._least = math.inf
         self._known: dict[tuple[str, float], F64] = {}
         self.smooth: F32 | None = None
+        self.as_made: tuple[MaterialPrior, F32] | None = None
 
     @classmethod
     def of(cls, problem: VoxelProblem, settings: TrialSettings = _USUAL_SETTINGS) -> Trial | None:
@@ -269,6 +289,20 @@ class Trial:
         whole = problem.projector.geometry
         above = 0.0 if whole.is_cone else (rows.start + rows.stop - whole.detector_shape[0]) / 2
         return cls(problem, part, np.maximum(first, 0, out=first), unseen, all_columns, settings, above)
+
+    def in_the_middle(self, count: int) -> tuple[Trial, slice]:
+        """The same trial with only the `count` rows in the middle, and these rows; all rows if they do not show slices.
+
+        Tests of volumes that exist already take less time with fewer rows.
+        """
+        geometry = self.problem.projector.geometry
+        n = geometry.detector_shape[0]
+        if n <= count or not geometry.rows_show_slices:
+            return self, slice(None)
+        rows = slice((n - count) // 2, (n - count) // 2 + count)
+        part = copy(self)
+        part.problem, part.unseen = _with_rows(self.problem, rows), _with_rows(self.unseen, rows)
+        return part, rows
 
     @property
     def ended(self) -> bool:

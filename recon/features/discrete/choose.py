@@ -151,12 +151,17 @@ class MaterialTrial:
 
     def predicts_in_halves(self, materials: MaterialPrior) -> bool:
         """Whether half voxels with these levels predict held-out projections as well as whole voxels."""
-        whole = self._volume_by(pull_to(materials, self._trial.problem, self._start))
+        made = self._trial.as_made
+        if made is not None and made[0] == materials:
+            whole = made[1]
+        else:
+            whole = self._volume_by(pull_to(materials, self._trial.problem, self._start))
         return halves_predict(self._trial, whole, self._weight * materials.tv_share, partial(pull_to, materials))
 
     def _is_better(self, materials: MaterialPrior) -> bool:
         """Whether a volume as it will be made with these levels predicts better than total variation."""
         volume = self._volume_by(pull_to(materials, self._trial.problem, self._start))
+        self._trial.as_made = materials, volume
         return bool(self._trial.residuals(volume).mean() < self.smooth.mean())
 
     def _share_of_smoothing(
