@@ -115,10 +115,10 @@ def reference_findings(evidence: Evidence, limits: ReferenceLimits | None = None
     return tuple(judged)
 
 
-def _in_words(name: str, kind: FrameKind, bad_frames: list[BadFrames], severity: Severity) -> Iterator[Finding]:
+def _in_words(name: str, kind: FrameKind, groups: list[BadFrames], severity: Severity) -> Iterator[Finding]:
     """One finding for each sentence, with all the frames that it names."""
-    for sentence in dict.fromkeys(each.sentence for each in bad_frames):
-        alike = [each for each in bad_frames if each.sentence == sentence]
+    for sentence in dict.fromkeys(each.sentence for each in groups):
+        alike = [each for each in groups if each.sentence == sentence]
         own = tuple(sorted(frame.row for each in alike for frame in each.frames))
         text = f"The {kind.name.lower()}s {spans(own)}: {sentence}" if own else sentence
         yield Finding(severity, name, text, own, alike[0].score, alike[0].limit)

@@ -156,14 +156,14 @@ class StampedValues:
             event = event_in(line) or {}
             # a field is missing, or has another type
             with suppress(LookupError, TypeError, ValueError, ArithmeticError):
-                time, values_of_event, severity = float(event["time"]), event_values(values, event), _severity(event)
+                event_time, values_of_event, severity = float(event["time"]), event_values(values, event), _severity(event)
                 texts = {
                     name: one_line(value, LONGEST) for name, value in values_of_event.items() if isinstance(value, str)
                 }
                 values = replace(values, **{**values_of_event, **texts})
                 for name in values_of_event:
                     worst = severity if name in _ALARMED else Severity.NO_ALARM
-                    stamps[name] = Stamp(time, worst, values.message if worst else "")
+                    stamps[name] = Stamp(event_time, worst, values.message if worst else "")
         return replace(self, values=values, stamps=stamps)
 
     def with_file(self, seen: Mapping[str, Any], angle: float, now: float) -> StampedValues:
