@@ -156,7 +156,11 @@ class StampedValues:
             event = event_in(line) or {}
             # a field is missing, or has another type
             with suppress(LookupError, TypeError, ValueError, ArithmeticError):
-                event_time, values_of_event, severity = float(event["time"]), event_values(values, event), _severity(event)
+                event_time, values_of_event, severity = (
+                    float(event["time"]),
+                    event_values(values, event),
+                    _severity(event),
+                )
                 texts = {
                     name: one_line(value, LONGEST) for name, value in values_of_event.items() if isinstance(value, str)
                 }

@@ -214,12 +214,12 @@ def _best_weight(trial: Trial, fit: StateFit) -> BestStrength | None:
 
 
 def _halves_predict(trial: Trial, fit: StateFit, weight: float) -> bool:
-    """Whether half voxels predict held-out projections as well as whole voxels."""
-    volume = fit.again(weight, fit.x)
-    volume.sharpen(1, CLEAR_LINES)
-    whole = trial.residuals(volume.x)
-    volume.on_half_voxels(CLEAR_LINES)
-    return predict_as_well_as(trial.residuals(volume.x), whole, _LARGEST_LOSS_OF_HALVES)
+    """Whether half voxels predict held-out projections as well as whole voxels. This ends the fit."""
+    fit.weight = weight
+    fit.sharpen(1, CLEAR_LINES)
+    whole = trial.residuals(fit.x)
+    fit.on_half_voxels(CLEAR_LINES)
+    return predict_as_well_as(trial.residuals(fit.x), whole, _LARGEST_LOSS_OF_HALVES)
 
 
 def _without(trial: Trial, fit: StateFit, smooth: F32, mu: float) -> BestStrength | None:

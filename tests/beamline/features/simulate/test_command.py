@@ -182,7 +182,7 @@ def test_the_energy_of_the_beam_is_in_the_file(folder: Path) -> None:
 
 def test_a_coarser_truth_tells_the_bin_that_it_is_for(folder: Path) -> None:
     made = beamline("simulate", "scene.yaml", "--out", "s.h5", "--truth", "t.h5", "--truth-bin", "4")
-    assert "voxels of 0.048 mm, for `beamline recon --bin 4`" in made.stdout
+    assert "voxels of 0.048 mm, as in volumes of `beamline recon --bin 4`" in made.stdout
     shape = "--truth has the shape (8, 10, 10), but the volume has (16, 20, 20) [z, y, x] with --bin 2. Give --bin 4."
     refused = beamline("recon", "s.h5", "-m", "fbp", "--axis", "21", "--bin", "2", "--truth", "t.h5", "-o", "r.h5")
     assert (refused.exit_code, shape in refused.stderr) == (2, True), refused.stderr
