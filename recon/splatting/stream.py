@@ -137,8 +137,8 @@ class StreamingFit:
 
         Args:
             kept: numbers, in order, of the projections that the fit keeps; `data` then contains only these. The fit
-                drops all other projections, and the learning rates start again from their first values, because the
-                model was fitted to the dropped projections, too. None: the fit keeps all projections.
+                drops the others. The learning rates then start again from their first values, because the model was
+                fitted to the dropped projections, too. None: the fit keeps all projections.
 
         Raises:
             ValueError: as for `add_views`, or there are no projections; nothing is changed.

@@ -67,8 +67,8 @@ class Discrete(HalfVoxels):
         iterations: largest number of iterations over all projections, not counting the FISTA-TV iterations before them.
         levels: densities of the materials in 1/mm, ascending; None: found by expectation maximisation (EM).
         still, half_voxels: as in `FistaTv`.
-        few: half voxels are used with levels if the projections are fewer than this share of the columns; without
-            levels, the rule of `FistaTv` holds.
+        few: if levels were found, half voxels are used for fewer projections than this number times the columns;
+            without levels, the rule of `FistaTv` holds.
     """
 
     name: ClassVar[str] = "discrete"
