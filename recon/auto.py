@@ -128,7 +128,7 @@ class Auto(Method):
             return choice
         units, weighed = trial.problem.units, trial.problem.weight is not None
         with threads_for(problem.grid):
-            wanted = chosen.predicts_in_halves(trial, units.prior(prior, weighed))
+            wanted = chosen.half_voxels_predict(trial, units.prior(prior, weighed))
         return choice.with_prior(prior._replace(half_voxels=wanted))
 
     @property

@@ -156,11 +156,8 @@ class StampedValues:
             event = event_in(line) or {}
             # a field is missing, or has another type
             with suppress(LookupError, TypeError, ValueError, ArithmeticError):
-                event_time, values_of_event, severity = (
-                    float(event["time"]),
-                    event_values(values, event),
-                    _severity(event),
-                )
+                event_time, severity = float(event["time"]), _severity(event)
+                values_of_event = event_values(values, event)
                 texts = {
                     name: one_line(value, LONGEST) for name, value in values_of_event.items() if isinstance(value, str)
                 }

@@ -55,8 +55,8 @@ class Prior(NamedTuple):
     @classmethod
     def of(cls, values: Sequence[Any]) -> Prior:
         """A prior, or its values from a file."""
-        weight, strength, patches, materials, *half_voxels = values  # without the last value in earlier versions
-        return cls(weight, strength, patches, materials and MaterialPrior(*materials), *half_voxels)
+        weight, strength, patches, materials, half_voxels = values
+        return cls(weight, strength, patches, materials and MaterialPrior(*materials), half_voxels)
 
 
 class IterationEnd(NamedTuple):

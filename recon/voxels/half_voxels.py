@@ -68,14 +68,15 @@ _MORE_VOLUMES = 0.6
 HALVES = "half_voxels"
 """Name of the decision whether half voxels predict held-out projections as well as whole voxels."""
 _TEST_ROWS, _MARGIN_ROWS = 8, 2
-"""Number of rows of the test reconstruction with half voxels, and of those at its top and bottom that do not count.
+"""Number of rows of the test reconstruction with half voxels, and number of rows at each end that do not count.
 
-The margin is needed because the whole voxels were made from more rows. Without it, whole voxels seem 0.3 to 1 % better.
+Whole voxels were made from more rows. If the rows at the ends counted, whole voxels would seem 0.3 to 1 % better.
 """
 _LARGEST_LOSS = 0.004
-"""Share by which the residual of half voxels in held-out projections may be larger (docs/decisions/voxels.md).
+"""Half voxels are used if they increase the residual in held-out projections by at most this share.
 
-The test reconstruction must converge: after 6 iterations, its residual does not tell gains and losses apart.
+The measurements are in docs/decisions/voxels.md. The test reconstruction must converge. After 6 iterations, its
+residual does not show whether half voxels improve the volume.
 """
 BY_QUALITY: dict[Quality, bool | None] = {"preview": False, "standard": None, "best": True}
 """Whether the last iterations use half voxels, for each preset; None: see `uses_half_voxels`."""
@@ -125,7 +126,7 @@ class HalfVoxels(VoxelMethod):
         on_halves = replace(self.buffers, volumes=self.buffers.volumes + _MORE_VOLUMES, filtered=False)
         return max(whole, bytes_of(on_halves, geometry, halved(grid), weighted))
 
-    def predicts_in_halves(self, trial: Trial, prior: Prior) -> bool:
+    def half_voxels_predict(self, trial: Trial, prior: Prior) -> bool:
         """Whether half voxels predict the held-out projections of a trial as well as whole voxels.
 
         Args:
@@ -133,10 +134,10 @@ class HalfVoxels(VoxelMethod):
         """
         weight = prior.weight / math.sqrt(ONE_IN / (ONE_IN - 1))  # see `choose_weight`
         whole = trial.volume_of_weight(weight) if trial.smooth is None else trial.smooth
-        return halves_predict(trial, whole, weight)
+        return half_voxels_predict(trial, whole, weight)
 
     def uses_halves(self, problem: VoxelProblem, prior: Prior, trial: Callable[[], Trial | None]) -> bool:
-        """Whether the last iterations of the volume use half voxels: `halves`, and `predicts_in_halves`.
+        """Whether the last iterations of the volume use half voxels: `halves`, and `half_voxels_predict`.
 
         If the prior was chosen before, or if no projections can be held out, nothing more is tested.
         """
@@ -145,7 +146,7 @@ class HalfVoxels(VoxelMethod):
             if problem.prior is not None:
                 return problem.prior.half_voxels is not False
             judge = trial()
-            return judge is None or self.predicts_in_halves(judge, prior)
+            return judge is None or self.half_voxels_predict(judge, prior)
 
         projector = problem.projector
         return self.halves(projector.geometry, projector.grid) and problem.decide(HALVES, decided)
@@ -204,7 +205,7 @@ def uses_half_voxels(wanted: bool | None, geometry: Geometry, grid: Grid, few: f
     return wanted is True or (are_few and abs(width - 1) < _AS_WIDE and not geometry.is_cone)
 
 
-def halves_predict(trial: Trial, whole: F32, mu: float, pull: MakePull | None = None) -> bool:
+def half_voxels_predict(trial: Trial, whole: F32, mu: float, pull: MakePull | None = None) -> bool:
     """Whether half voxels predict the held-out projections of a trial as well as whole voxels.
 
     Args:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
-from recon.base.decisions import Decisions, GoesOn, MaterialPrior, Prior
+from recon.base.decisions import Decisions, GoesOn, Prior
 from recon.base.empirical import FIRST_THRESHOLD, ONE_IN, STILL_IN_TRIAL
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Method, ReconProblem, RunControl
@@ -168,18 +168,8 @@ class Predicting(Protocol):
 def _with_rows(problem: VoxelProblem, rows: slice) -> VoxelProblem:
     """The problem with only these rows, which show slices."""
     views, box = slab_of(problem.projector.geometry, problem.projector.grid, rows.start, rows.stop)
-    all_columns = problem.with_all_columns
-
-    def cut(rays: F32 | None) -> F32 | None:
-        return None if rays is None else np.ascontiguousarray(rays[:, :, rows])
-
-    data = cut(problem.data)
-    assert data is not None
-    return replace(
-        problem, projector=replace(problem.projector, geometry=views, grid=box), data=data, weight=cut(problem.weight),
-        measured=cut(problem.measured), _norms=[],
-        with_all_columns=None if all_columns is None else lambda: _with_rows(all_columns(), rows),
-    )  # fmt: skip
+    part, all_columns = problem.part(views, box, slice(None), slice(None), rows), problem.with_all_columns
+    return part if all_columns is None else replace(part, with_all_columns=lambda: _with_rows(all_columns(), rows))
 
 
 class AllColumns(NamedTuple):
@@ -210,7 +200,6 @@ class Trial:
             because its rows keep their heights.
         smooth: the volume of total variation that predicts the held-out projections best so far.
         settings: settings of the run to which the trial belongs.
-        as_made: the last volume that was made with these discrete levels and all settings of the final volume.
     """
 
     def __init__(
@@ -227,7 +216,6 @@ class Trial:
         self._least = math.inf
         self._known: dict[tuple[str, float], F64] = {}
         self.smooth: F32 | None = None
-        self.as_made: tuple[MaterialPrior, F32] | None = None
 
     @classmethod
     def of(cls, problem: VoxelProblem, settings: TrialSettings = _USUAL_SETTINGS) -> Trial | None:
@@ -258,15 +246,8 @@ class Trial:
         matter: tuple[slice, Geometry, Grid] | None = None,
     ) -> Trial | None:  # fmt: skip
         def of_views(chosen: NDArray[np.intp], cols: slice, views: Geometry, box: Grid) -> VoxelProblem:
-            def of_rows(rays: F32) -> F32:
-                return np.ascontiguousarray(rays[chosen][:, cols, rows])
-
             return replace(
-                problem,
-                projector=replace(problem.projector, geometry=views.select(chosen), grid=box),
-                data=of_rows(problem.data),
-                measured=None if problem.measured is None else of_rows(problem.measured),
-                weight=None if problem.weight is None else of_rows(problem.weight),
+                problem.part(views.select(chosen), box, chosen, cols, rows),
                 rng=np.random.default_rng(0),
                 go_on=GoesOn(trials=problem.go_on.trials),
                 decide=Decisions(),

@@ -226,6 +226,23 @@ class VoxelProblem:
         self._norms.append((self.projector, self.weight, norm))
         return self._norms[-1][-1]
 
+    def part(
+        self, geometry: Geometry, grid: Grid, views: NDArray[np.intp] | slice, cols: slice, rows: slice
+    ) -> VoxelProblem:
+        """The problem of some projections, columns and rows, which have this geometry, on this grid."""
+
+        def cut(rays: F32) -> F32:
+            return np.ascontiguousarray(rays[views][:, cols, rows])
+
+        return replace(
+            self,
+            projector=replace(self.projector, geometry=geometry, grid=grid),
+            data=cut(self.data),
+            measured=None if self.measured is None else cut(self.measured),
+            weight=None if self.weight is None else cut(self.weight),
+            _norms=[],
+        )
+
     @property
     def prior(self) -> Prior | None:
         """The prior that was chosen before; None: the method decides."""

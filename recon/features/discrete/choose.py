@@ -22,7 +22,7 @@ from recon.features.discrete.mixture import (
     thin_parts,
 )
 from recon.voxels.choice import LEAST_GAIN, significantly_better
-from recon.voxels.half_voxels import halves_predict
+from recon.voxels.half_voxels import half_voxels_predict
 from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem
 
@@ -149,20 +149,14 @@ class MaterialTrial:
             return best, fewer
         return None
 
-    def predicts_in_halves(self, materials: MaterialPrior) -> bool:
+    def half_voxels_predict(self, materials: MaterialPrior) -> bool:
         """Whether half voxels with these levels predict held-out projections as well as whole voxels."""
-        made = self._trial.as_made
-        if made is not None and made[0] == materials:
-            whole = made[1]
-        else:
-            whole = self._volume_by(pull_to(materials, self._trial.problem, self._start))
-        return halves_predict(self._trial, whole, self._weight * materials.tv_share, partial(pull_to, materials))
+        whole, weight = self._as_made(materials), self._weight * materials.tv_share
+        return half_voxels_predict(self._trial, whole, weight, partial(pull_to, materials))
 
     def _is_better(self, materials: MaterialPrior) -> bool:
         """Whether a volume as it will be made with these levels predicts better than total variation."""
-        volume = self._volume_by(pull_to(materials, self._trial.problem, self._start))
-        self._trial.as_made = materials, volume
-        return bool(self._trial.residuals(volume).mean() < self.smooth.mean())
+        return bool(self._trial.residuals(self._as_made(materials)).mean() < self.smooth.mean())
 
     def _share_of_smoothing(
         self, best: F64, chosen: MaterialPrior, least_share: float
@@ -220,6 +214,10 @@ class MaterialTrial:
         material_pull = MaterialPull(prior._replace(noise=noise), self._where, none_thin, follows=self._levels is None)
         x = self._volume_by(material_pull)
         return self._trial.residuals(x), material_pull.materials_in(x)._replace(noise=NOISE)
+
+    def _as_made(self, materials: MaterialPrior) -> F32:
+        """The volume with all settings of the final volume with these levels."""
+        return self._volume_by(pull_to(materials, self._trial.problem, self._start))
 
     def _volume_by(self, pull: MaterialPull) -> F32:
         """The volume of total variation that is pulled to these levels."""

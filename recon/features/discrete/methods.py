@@ -181,13 +181,13 @@ class Discrete(HalfVoxels):
             problem, x, mu * materials.tv_share, TV_STEPS, pull, self.first_sweeps - sweeps_before
         )
 
-    def predicts_in_halves(self, trial: Trial, prior: Prior) -> bool:
+    def half_voxels_predict(self, trial: Trial, prior: Prior) -> bool:
         """Whether half voxels predict held-out projections as well as whole voxels, with these levels if there are
         any."""
         materials = prior.materials
         if materials is None or not materials.levels:
-            return super().predicts_in_halves(trial, prior)
-        return MaterialTrial(trial, prior.weight, self.iterations, materials.levels).predicts_in_halves(materials)
+            return super().half_voxels_predict(trial, prior)
+        return MaterialTrial(trial, prior.weight, self.iterations, materials.levels).half_voxels_predict(materials)
 
     def materials(
         self, problem: VoxelProblem, weight: TvWeight, trial: Callable[[], Trial | None]

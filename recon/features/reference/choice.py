@@ -39,13 +39,11 @@ MARGIN = 16  # voxels beyond the box in which the reference is also kept, becaus
 # first weight of the total variation of the change, divided by the best weight of total variation
 _FIRST_CHANGE_WEIGHT = 1.4
 _LARGEST_LOSS_OF_HALVES = 0.015
-"""Share by which the residual of half voxels in held-out projections may be larger.
+"""Half voxels are used if they increase the residual in held-out projections by at most this share.
 
-On packed balls (30 and 60 projections of 160 columns), this residual is at most 0.8 % larger, and half voxels change
-the PSNR by -0.1 to +0.6 dB. On a measured walnut with hardly any noise it is 6 to 12 % larger from 60 to 100
-projections of 128 columns, and half voxels increase the residual in projections that were not used by 2 to 3 %. With
-10³ photons per pixel, half voxels reduce it by 24 % from 60 projections of the walnut, and the first residual is 0.4 %
-smaller.
+On packed balls (30 and 60 projections of 160 columns), half voxels increase the residual by at most 0.8 %, and change
+the PSNR by -0.1 to +0.6 dB. On a measured walnut with hardly any noise (60 to 100 projections of 128 columns), they
+increase it by 6 to 12 %, and make the volume worse: the residual in projections that were not used grows by 2 to 3 %.
 """
 _DISPLACED_SWEEPS = 6  # iterations with a displaced copy
 
@@ -60,7 +58,7 @@ class ReferenceVerdict(NamedTuple):
         affine, splines: coefficients of the displacement in mm, for `Basis.affine` and for `Basis.splines`. `affine` is
             for heights from the middle of the reference, which all slabs of a volume share.
         gains: gain of the ground, and one gain for all particles.
-        halves_predict: False: half voxels predict held-out projections worse than whole voxels, so they are not used.
+        half_voxels: True if the volume ends on half voxels, because these predict held-out projections about as well.
     """
 
     used: bool
@@ -69,7 +67,7 @@ class ReferenceVerdict(NamedTuple):
     affine: Sequence[float] = ()
     splines: Sequence[float] = ()
     gains: Sequence[float] = (1.0, 1.0)
-    halves_predict: bool = True
+    half_voxels: bool = False
 
     @classmethod
     def of(cls, values: Sequence[Any]) -> ReferenceVerdict:
@@ -138,7 +136,7 @@ def _in_rows(reference: Volume, problem: VoxelProblem) -> Moved | str:
 def asked(trial: Trial, choice: TrialChoice, reference: Volume, halves: bool) -> ReferenceVerdict:
     """Make the three tests on the rows and projections of a trial. `choice` is the choice of `auto`.
 
-    With `halves`, a fourth test decides whether the volume ends on half voxels.
+    If `halves` is True, a fourth test decides whether the volume ends on half voxels.
 
     For a cone beam no reference is used, because held-out projections preferred a reference whose volume was up to 2 dB
     worse than the volume of `auto`.
@@ -198,8 +196,8 @@ def asked(trial: Trial, choice: TrialChoice, reference: Volume, halves: bool) ->
         (edge * motion_voxels).ravel().tolist()
         for motion_voxels in (from_reference_middle, bent.mean(-1, keepdims=True))
     ]
-    halves_too = not halves or _halves_predict(trial, fit, best.strength)
-    return ReferenceVerdict(True, residuals_text, of_scan, motion_mm[0], motion_mm[1], gains, halves_too)
+    half_voxels = halves and _half_voxels_predict(trial, fit, best.strength)
+    return ReferenceVerdict(True, residuals_text, of_scan, motion_mm[0], motion_mm[1], gains, half_voxels)
 
 
 def _best_weight(trial: Trial, fit: StateFit) -> BestStrength | None:
@@ -213,7 +211,7 @@ def _best_weight(trial: Trial, fit: StateFit) -> BestStrength | None:
     return preferred_strength(residuals_of, fit.weight)
 
 
-def _halves_predict(trial: Trial, fit: StateFit, weight: float) -> bool:
+def _half_voxels_predict(trial: Trial, fit: StateFit, weight: float) -> bool:
     """Whether half voxels predict held-out projections as well as whole voxels. This ends the fit."""
     fit.weight = weight
     fit.sharpen(1, CLEAR_LINES)

@@ -123,7 +123,7 @@ class FromReference(Method):
         assert self.reference is not None and control.decide is not None
         begin, history = control.now(), list[Progress]()
         wanted = uses_half_voxels(self.half_voxels, problem.geometry, problem.grid, _FEW)
-        halves = wanted and verdict.halves_predict
+        halves = wanted and verdict.half_voxels
         planned = (1 + len(_ROUNDS)) * _FIRST_ITERATIONS + (_SHARPENING_ROUNDS + COST * halves) * _LAST_ITERATIONS
 
         def report(iteration: int, residual: float) -> None:

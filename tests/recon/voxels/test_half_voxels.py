@@ -22,8 +22,8 @@ from recon.voxels.half_voxels import (
     COST,
     HALVES,
     HalfVoxels,
+    half_voxels_predict,
     halved,
-    halves_predict,
     uses_half_voxels,
     with_halves,
 )
@@ -175,11 +175,11 @@ def test_they_are_rejected_if_whole_voxels_predict_better() -> None:
     geometry = geometry_of(20)
     volume = np.repeat(truth()[None], ROWS, 0).astype(np.float32)
     exact = trial_of(recon.Projector(geometry, Grid.matching(geometry)).forward(volume), geometry)
-    assert not halves_predict(exact, exact.lines_of(Volume(volume, Grid.matching(geometry))), 1e-3)
+    assert not half_voxels_predict(exact, exact.lines_of(Volume(volume, Grid.matching(geometry))), 1e-3)
     noisy = np.random.default_rng(1).normal(exact_views(geometry), 0.01).astype(np.float32)
     trial = trial_of(noisy, geometry)
     assert trial.weight is not None
-    assert recon.FistaTv().predicts_in_halves(trial, Prior(trial.weight))
+    assert recon.FistaTv().half_voxels_predict(trial, Prior(trial.weight))
 
 
 @pytest.mark.parametrize("method", [recon.FistaTv(), recon.Discrete(), recon.Auto()])
@@ -200,11 +200,6 @@ def test_auto_tests_them_for_the_method_that_it_chose() -> None:
     assert choice.prior is not None and choice.prior.half_voxels is True
     never = recon.Auto().with_quality("preview", 0).choose(problem, RunControl())
     assert never.prior is not None and never.prior.half_voxels is None
-
-
-def test_a_prior_of_an_earlier_version_has_no_test_of_them() -> None:
-    assert Prior.of((0.5, 0.0, False, None)) == Prior(0.5)
-    assert Prior.of((0.5, 0.0, False, None, False)) == Prior(0.5, half_voxels=False)
 
 
 def test_a_stop_leaves_them_out() -> None:

@@ -15,6 +15,7 @@ from recon.base.decisions import Decisions
 from recon.base.method import DataUse, ReconProblem, RunControl
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
+from recon.features.reference.choice import ReferenceVerdict
 from tests.recon.features.reference.scene import LEVEL, ROWS, Discs, N, balls_near_one_end, packed, psnr, scanned
 from tests.slow_cases import others_slow
 
@@ -120,31 +121,38 @@ def test_weights_of_rays_are_used(before: Volume, state: tuple[F32, recon.Geomet
 
 
 def test_with_few_projections_the_last_iterations_use_half_voxels(before: Volume) -> None:
-    """20 projections are fewer than a third of the 64 columns. With this noise, half voxels predict as well."""
-    data, geometry = scanned(STATE, 20, 1e4, seed=2)
+    """20 projections are fewer than a third of the 64 columns.
+
+    With this noise, the residual of half voxels in held-out projections is 2.4 % larger, so the program rejects them.
+    Here they are used because the stored decision is replaced.
+    """
+    data, geometry = scanned(STATE, 20, 1e4, seed=1)
     decide, method = Decisions(), recon.FromReference(before, AUTO)
-    halves = recon.reconstruct(data, geometry, method, control=RunControl(decide=decide))
-    again, never = RunControl(decide=Decisions(0, decide.made)), replace(method, half_voxels=False)
+    tested = recon.reconstruct(data, geometry, method, control=RunControl(decide=decide))
+    verdict = ReferenceVerdict.of(decide.made["reference"][0])
+    assert verdict.used and not verdict.half_voxels and "half_voxel_iterations" not in tested.settings
+    passed = {**decide.made, "reference": [verdict._replace(half_voxels=True)]}
+    halves = recon.reconstruct(data, geometry, method, control=RunControl(decide=Decisions(0, passed)))
+    again, never = RunControl(decide=Decisions(0, passed)), replace(method, half_voxels=False)
     whole = recon.reconstruct(data, geometry, never, control=again)
     assert 0 < halves.settings["half_voxel_iterations"] <= 12
     assert "half_voxel_iterations" not in whole.settings
     assert halves.history[-1].step > whole.history[-1].step
+    np.testing.assert_array_equal(whole.volume.data, tested.volume.data)
     truth, x, other = STATE.volume, halves.volume.data, whole.volume.data
     slit = ndi.binary_dilation(replace(STATE, slit=-1).volume > truth, iterations=2)
-    assert psnr(x, truth) > psnr(other, truth) - 0.2
-    assert np.square(x - truth)[slit].mean() < 1.05 * np.square(other - truth)[slit].mean()
+    assert psnr(x, truth) > psnr(other, truth)
+    assert np.square(x - truth)[slit].mean() < 0.96 * np.square(other - truth)[slit].mean()
     tall = replace(geometry, detector_shape=(64, N), axis_row=31.5)
     grid = Grid.matching(tall)
     assert method.memory(tall, grid, False) > 1.4 * never.memory(tall, grid, False)
 
 
-def test_half_voxels_that_predict_worse_are_not_used(before: Volume) -> None:
-    """With the noise of this seed, their residual in held-out projections is 2.4 % larger."""
-    data, geometry = scanned(STATE, 20, 1e4, seed=1)
-    method = recon.FromReference(before, AUTO)
-    made, never = (recon.reconstruct(data, geometry, each) for each in (method, replace(method, half_voxels=False)))
-    assert made.settings["reference_used"] and "half_voxel_iterations" not in made.settings
-    np.testing.assert_array_equal(made.volume.data, never.volume.data)
+def test_half_voxels_that_predict_as_well_are_used(before: Volume) -> None:
+    """With the noise of this seed, their residual in held-out projections is 0.6 % larger."""
+    data, geometry = scanned(STATE, 20, 1e4, seed=2)
+    made = recon.reconstruct(data, geometry, recon.FromReference(before, AUTO))
+    assert 0 < made.settings["half_voxel_iterations"] <= 12
 
 
 def test_presets_ask_for_half_voxels_or_for_none() -> None:
