@@ -55,8 +55,8 @@ def reconstruct(
     Values that are masked or not finite are filled from their neighbours and get weight 0. If photons are few, give the
     measured `Counts` instead of line integrals. `Counts` are converted to line integrals with weights that
     represent the likelihood of the counts (`recon.prep.counts.line_integrals`). The weights from the counts are
-    multiplied by `use.weights`. `Views` contain their geometry, their weights and the reach of the sample, so
-    `reconstruct` does not measure the reach again.
+    multiplied by `use.weights`. `Views` contain their geometry, their weights and how far the sample reaches,
+    so `reconstruct` measures none of these again.
 
     A fit always covers everything that the projections see. Therefore the voxels of a smaller box that you ask for are
     identical to the same voxels of the whole volume.
@@ -140,10 +140,11 @@ def _warn_of_unseen_cone(method: Method, geometry: Geometry) -> None:
     lean = geometry.unseen_cone
     if lean and any(each.trial_sweeps for each in method.alternatives):
         warnings.warn(
-            "give a weight of total variation: fista-tv with tv_weight 0.001, or 0.002 for a plate with sharp "
-            f"edges. In all projections the rotation axis is tilted along the beam, by {math.degrees(lean):.3g} "
-            "degrees or more, so no projection shows structure along the axis, such as the faces of a plate. "
-            "Held-out projections do not show such structure either, so they would choose a weight that is too small",
+            "set the weight of total variation yourself: use fista-tv with tv_weight 0.001, or with 0.002 for a plate "
+            "with sharp edges. The automatic weight is too small for this scan. The rotation axis is tilted along the "
+            f"beam by {math.degrees(lean):.3g} degrees or more in all projections, so no projection shows the faces of "
+            "a plate that lies across the axis. The held-out projections, which choose the weight, do not show them "
+            "either",
             stacklevel=3,
         )
 

@@ -128,7 +128,7 @@ pause = _command(
 )
 resume = _command(
     "resume",
-    "Continue a paused scan, from another terminal.\n\n\b\nbeamline resume        the only running scan in ./runs\n"
+    "Continue a paused scan, from another terminal.\n\n\b\nbeamline resume        the paused scan in ./runs\n"
     "beamline resume RUN    the scan in the folder RUN",
 )
 stop = _command(

@@ -377,8 +377,9 @@ class Config(Section):
         n = self.scan.frames_per_view
         if n > 1 and self.scan.mode is Mode.FLY:
             raise ValueError(
-                f"scan.frames_per_view {n}: each frame of a fly scan has its own angle. Set scan.mode to step, or "
-                "plan more projections, which collect the same number of photons in total"
+                f"scan.frames_per_view {n}: a fly scan cannot take several frames at one angle, because the stage does "
+                "not stop. Set scan.mode to step, or frames_per_view to 1 and plan more projections: the scan then "
+                "collects the same number of photons"
             )
         if n > 1 and self.monitor.retake:
             raise ValueError(

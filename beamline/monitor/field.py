@@ -60,11 +60,14 @@ class FieldOfViewCheck(Logged):
     name: ClassVar[str] = "field"
     bit: ClassVar[int] = 13
     unit: ClassVar[str] = (
-        "fraction of the frame (flats), or line integral at the edge of the field of view (projections)"
+        "fraction of the pixels that get no beam (flats), or line integral at the edge of the field of view "
+        "(projections)"
     )
     meaning: ClassVar[str] = "a part of the frame gets no beam even without a sample"
 
-    unlit: float = setting(0.02, "fraction of a flat without beam above which there is a warning", ge=0, lt=1)
+    unlit: float = setting(
+        0.02, "the check warns if a larger fraction of the pixels of a flat gets no beam", ge=0, lt=1
+    )
     edge: float = setting(LEAST, "line integral at the edges up to which the sample counts as inside", ge=0)
 
     start = FieldState

@@ -105,8 +105,8 @@ class OppositeCheck(Logged):
     warn: float = setting(0.5, "largest allowed motion or change of the sample, in pixels", ge=0)
     changed: float = setting(
         1.0,
-        "largest allowed change of the shape of the sample, in pixels: a shift of the whole sample by this distance "
-        "would change the projection as much",
+        "largest allowed change of the shape of the sample. The change is stated as the shift, in pixels, of a rigid "
+        "sample that would change the projection as much",
         ge=0,
     )
     axis: float = setting(1.0, "largest allowed distance of the axis from the stated position, in pixels", ge=0)

@@ -342,7 +342,7 @@ def test_a_leaning_axis_asks_for_a_weight_as_no_view_judges_structure_along_it(
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         recon.reconstruct(views, geometry, method)
-    said = [str(each.message) for each in told if "is tilted along the beam, by 30 degrees" in str(each.message)]
+    said = [str(each.message) for each in told if "tilted along the beam by 30 degrees" in str(each.message)]
     assert bool(said) is warned
     assert all("tv_weight 0.001" in each for each in said)
 

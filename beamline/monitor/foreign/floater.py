@@ -92,7 +92,8 @@ class FloaterCheck(Logged):
 
     warn: float = setting(
         7.0,
-        "sum of the absorption along the path of a particle, in standard deviations, above which there is a warning",
+        "the check warns if the absorption of a particle, added up along its path, exceeds this number of standard "
+        "deviations",
         ge=0,
     )
 

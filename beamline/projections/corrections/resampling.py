@@ -195,8 +195,8 @@ def with_tilt(
     tilt_sentence = f"The axis is tilted by {tilt_text(tilt, uncertainty)}, {offset_px:.2g} px over {rows} rows"
     if uncertainty * rows > MATTERS:
         warn(
-            "Check the first and the last slices for double edges, because the tilt is not known to half a "
-            f"pixel. {tilt_sentence}."
+            "Check the first and the last slices for double edges: the tilt is so uncertain that the axis may shift by "
+            f"more than {MATTERS:g} pixels from the first to the last row. {tilt_sentence}."
         )
     negligible = abs(tilt) < 2 * uncertainty or abs(tilt) * rows < _NEGLIGIBLE_PX
     step = replace(step, tilt=0.0 if negligible else math.degrees(tilt))

@@ -43,7 +43,8 @@ class AreaDetectorSettings:
     min_period: float = setting(0.0, "Shortest time between two triggers.", unit="s", ge=0, le=100)
     dead: float = setting(
         0.0,
-        "Dead time between two exposures. Give the value of readout_s if the camera cannot expose during readout.",
+        "Shortest time from the end of an exposure to the start of the next one. If the camera cannot expose during "
+        "readout, give the value of readout_s.",
         unit="s",
         ge=0,
         le=100,

@@ -83,8 +83,8 @@ _FILE = click.Path(path_type=Path)
 @click.option(
     "--quick",
     is_flag=True,
-    help="Do not reconstruct from halves of the projections. This is faster, but the intervals leave out the error "
-    "from few projections.",
+    help="Faster: do not reconstruct the scan again from each half of the projections. The intervals then leave out "
+    "the error that comes from few projections.",
 )
 @click.option(
     "--crop",

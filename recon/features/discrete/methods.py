@@ -104,8 +104,10 @@ class Discrete(HalfVoxels):
 
     @property
     def refused_sweeps(self) -> int:
-        """Usual largest number of iterations of the tests that may reject discrete levels for the voxel refinement of a
-        Gaussian fit. After a rejection of discrete levels, PnP-DCT may be tried.
+        """Iterations that the tests of discrete levels usually take before they reject the levels, at most.
+
+        The forecast of a Gaussian fit adds this number: if its voxel refinement rejects the levels, it tries PnP-DCT
+        after these tests.
         """
         return _TRIALS_TO_REJECT * self.usual_sweeps
 
