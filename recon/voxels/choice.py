@@ -1,8 +1,8 @@
 """Chooses the candidate, or the strength of a prior, that predicts held-out projections best.
 
 Candidates are compared projection by projection, because projections differ more than candidates do. The choice is the
-simplest candidate that the best one does not beat by more than one standard error. For strengths, the choice is the one
-with the smallest mean residual.
+simplest candidate that no other one clearly beats. For strengths, the choice is the one with the smallest mean
+residual.
 """
 
 from __future__ import annotations
@@ -21,6 +21,13 @@ LEAST_GAIN = 0.02
 """Share by which a costlier candidate must lower the residual to be chosen.
 
 (On a scan of a tooth, a fit lowers the residual by 1.3 % and takes four times as long.)
+"""
+
+_SURE_SHARE, _SURE_ERRORS = 0.25, 4.0
+"""A candidate that costs little more than the simpler ones is also chosen for a small but certain gain: for this share
+of `LEAST_GAIN`, if the gain exceeds this number of standard errors.
+
+(PnP-DCT instead of total variation, see docs/decisions/voxels.md.)
 """
 
 # name of the measure in the explanation of a choice
@@ -55,16 +62,11 @@ def predicts_as_well(residuals: F64, best: F64) -> bool:
     return not exceeds_standard_error(residuals - best, _ERRORS)
 
 
-def significantly_better(residuals: F64, reference_residuals: F64, least_gain: float) -> bool:
-    """Whether residuals [held-out view] are lower than others by the share `least_gain` and by more than chance."""
+def significantly_better(residuals: F64, reference_residuals: F64, least_gain: float, errors: float = _ERRORS) -> bool:
+    """Whether residuals [held-out view] are lower than others by the share `least_gain` and by `errors` standard errors
+    of the difference."""
     by_more = float(residuals.mean()) < (1 - least_gain) * float(reference_residuals.mean())
-    return by_more and exceeds_standard_error(reference_residuals - residuals, _ERRORS)
-
-
-def _simplest_of(residuals: dict[int, F64], least_gain: float) -> int:
-    """Number of the first of these candidates that the best of them does not beat significantly."""
-    least = min(residuals.values(), key=lambda each: float(each.mean()))
-    return next(number for number, each in residuals.items() if not significantly_better(least, each, least_gain))
+    return by_more and exceeds_standard_error(reference_residuals - residuals, errors)
 
 
 class Prediction(NamedTuple):
@@ -76,12 +78,15 @@ class Prediction(NamedTuple):
         prior: the prior of the candidate's volume, which is used again for the volume from all projections. None: the
             candidate has no prior, or chooses it again.
         remark: the reason why the candidate was not tried or was stopped early; may be empty.
+        costs_little: whether the candidate takes at most about twice as long as simpler iterative candidates. Then a
+            small but certain gain suffices.
     """
 
     name: str
     residuals: Sequence[float] | None = None
     prior: Prior | None = None
     remark: str = ""
+    costs_little: bool = False
 
     @property
     def has_levels(self) -> bool:
@@ -106,8 +111,10 @@ class TrialChoice(NamedTuple):
     def of(cls, values: Sequence[Any]) -> TrialChoice:
         """Convert a choice, or its values from a file (see `Decisions`), to a choice."""
         part_of_scan, least_gain, predictions = values
-        named = ((name, residuals, prior and Prior.of(prior), remark) for name, residuals, prior, remark in predictions)
-        return cls(part_of_scan, least_gain, tuple(Prediction(*each) for each in named))
+        made = [Prediction(*each) for each in predictions]
+        return cls(
+            part_of_scan, least_gain, tuple(each._replace(prior=each.prior and Prior.of(each.prior)) for each in made)
+        )
 
     def after(self, prediction: Prediction) -> TrialChoice:
         """The choice with one more candidate."""
@@ -155,7 +162,7 @@ class TrialChoice(NamedTuple):
 
     @property
     def chosen(self) -> int | None:
-        """Number of the simplest candidate that the best one does not beat significantly; None: none was tried.
+        """Number of the simplest candidate that no other one clearly beats; None: none was tried.
 
         A candidate whose discrete levels passed all their tests takes the place of a simpler one, even if it lowers the
         residual by less than `least_gain`. (At 10³ photons noise is most of the residual: the levels of cracks from 90
@@ -167,24 +174,21 @@ class TrialChoice(NamedTuple):
         if not residuals:
             return None
         if levels is None or self.levels_suffice:
-            return _simplest_of(residuals, self.least_gain)
-        others = {number: each for number, each in residuals.items() if number != levels}
-        other = _simplest_of(others, self.least_gain)
+            return self._simplest_of(residuals)
+        other = self._simplest_of({number: each for number, each in residuals.items() if number != levels})
         return levels if residuals[levels].mean() < residuals[other].mean() else other
 
-    @property
-    def verdicts(self) -> list[str]:
-        """For each candidate "best", or "alike" if it predicts equally well within chance, or "".
+    def _simplest_of(self, residuals: dict[int, F64]) -> int:
+        """Number of the first of these candidates that neither the best of them nor one that costs little beats."""
+        best = min(residuals.values(), key=lambda each: float(each.mean()))
+        cheap = [each for number, each in residuals.items() if self.predictions[number].costs_little]
 
-        All are empty if the best candidate does not lower any other residual by `least_gain`."""
-        residuals, best_residuals, words = self.residuals_by_number, self.best_residuals, [""] * len(self.predictions)
-        if best_residuals is None or all(
-            (1 - self.least_gain) * each.mean() <= best_residuals.mean() for each in residuals.values()
-        ):
-            return words
-        for number, each in residuals.items():
-            words[number] = "best" if number == self.best else "alike" * predicts_as_well(each, best_residuals)
-        return words
+        def is_beaten(by_view: F64) -> bool:
+            return significantly_better(best, by_view, self.least_gain) or any(
+                significantly_better(each, by_view, _SURE_SHARE * self.least_gain, _SURE_ERRORS) for each in cheap
+            )
+
+        return next(number for number, by_view in residuals.items() if not is_beaten(by_view))
 
     @property
     def prior(self) -> Prior | None:
@@ -226,10 +230,15 @@ class TrialChoice(NamedTuple):
             _standard_error(of_simple - of_best) / of_simple.mean(),
         )
         margin = f"{self.least_gain:.0%} and by more than " if self.least_gain else "more than "
+        certain = (
+            f", or by {_SURE_SHARE * self.least_gain:.1%} and by more than {_SURE_ERRORS:.0f} standard errors"
+            if self.least_gain and self.predictions[self.best].costs_little
+            else ""
+        )
         return (
             f". The residual of {best} is {improvement:.2%} smaller than the residual of {simple} (standard error "
             f"{error:.2%}). {simple} was chosen, because it is simpler: a costlier method is chosen only if its "
-            f"residual is smaller by {margin}one standard error"
+            f"residual is smaller by {margin}one standard error{certain}"
         )
 
 

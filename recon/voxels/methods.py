@@ -283,8 +283,10 @@ class PnpDct(VoxelMethod):
                 self.name, remark=f"{self.name} not tried, because the sample is wider than the field of view"
             )
         if self.patch_threshold is not None or trial.prior is None or not trial.prior.strength:
-            return trial.predicted(self)
-        return trial.prediction(self.name, trial.residuals_of_patches(trial.prior.strength), trial.prior)
+            prediction = trial.predicted(self)
+        else:
+            prediction = trial.prediction(self.name, trial.residuals_of_patches(trial.prior.strength), trial.prior)
+        return prediction._replace(costs_little=True)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         sweeps = 0 if x.any() else self.first_sweeps

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from beamline.cli.options import as_scan, json_option, parsed
-from beamline.cli.terminal import answering
+from beamline.cli.terminal import Answer, answering
 from beamline.core.errors import DataError
 from beamline.core.files import atomic_file, refuse_existing, write_whole
 from beamline.core.text import csv_text, safe_name
 from splatline_structure.options import FEWEST_VIEWS
+
+if TYPE_CHECKING:
+    from splatline_structure.intervals import Interval
 
 
 def numbers_of_views(text: str) -> list[int]:
@@ -73,51 +77,14 @@ def study_structure(
 
     Example: beamline study structure scan.h5 --views 45,90,180
     """
-    import numpy as np
-
-    from beamline.api import Selection, reconstruct
     from beamline.report.html import Picture
     from splatline_structure import pictures, results
-    from splatline_structure.measuring import measured
-    from splatline_structure.numbers import Rules, structure_of
-    from splatline_structure.particles import NECK
-    from splatline_structure.volumes import ReadSlices, box_in
 
     output = output or Path(f"{safe_name(scan.name.split('.')[0])}_views")
-    values: dict[str, Any] = {
-        "materials": materials, "particles": None, "parts": None, "scan": scan, "quick": False,
-        "radius": 1, "smallest": 27, "neck": NECK, "side": 96, "through": 1,
-    }  # fmt: skip
     with answering(as_json) as answer:
         refuse_existing(output)
-        known = structure_of(  # of an empty volume, for the names of the numbers
-            np.zeros((2, 2, 2), np.float32), np.arange(1.0, materials), (1, 1, 1), Rules(materials, 1)
-        ).numbers
-        known_of = {name: [each for each in known if f"{each}_".startswith(f"{name}_")] for name in names}
-        if unknown := [name for name, each in known_of.items() if not each]:
-            raise click.UsageError(
-                f"--number {unknown[0]}: expected a kind of numbers, such as tortuosity, or one of {', '.join(known)}."
-            )
-        names = tuple(dict.fromkeys(chain(*known_of.values())))
-        tell, series, axis_col, box = answer.counting("reconstructing with fewer projections"), {}, None, None
-        for done, n in enumerate(sorted(views, reverse=True)):  # axis and box are those of the most projections
-            tell(done, len(views))
-            record = reconstruct(scan, method, views=f"fixed:{n}", selection=Selection(axis_col=axis_col), say=None)
-            if record.length_unit != "mm":
-                raise DataError(
-                    f"{scan} does not state the pixel size. Make a copy that states it: `beamline ingest {scan} "
-                    "COPY.h5 --pixel-size-um SIZE`. Nothing was written."
-                )
-            axis_col = record.axis_col
-            try:
-                box = box or box_in(record.volume.data, "square")
-                slices = slice(0, record.grid.shape[0])
-                read = ReadSlices(record, slices, slices, slices.stop)
-                series[n] = measured(scan, read, box, answer, **values).found.intervals
-            except ValueError as error:
-                raise DataError(
-                    f"{scan} cannot be measured with {n} projections: {error}. Nothing was written."
-                ) from error
+        names = _numbers_named(names, materials)
+        series = _measured_by_views(scan, views, method, materials, answer)
         rows = [[str(n), *results.cells(name, series[n][name])] for n in views for name in names]
         curves = pictures.curves_of({name: [series[n][name] for n in views] for name in names}, views, "projections")
         shown = [
@@ -136,3 +103,64 @@ def study_structure(
             write_whole(folder / "numbers.csv", csv_text([["n_views", *results.COLUMNS], *rows]))
             write_whole(folder / "report.html", page)
         answer.done({"output": output, "rows": rows}, *results.lines_of(table), f"output  {output}")
+
+
+def _numbers_named(kinds: tuple[str, ...], materials: int) -> tuple[str, ...]:
+    """The names of all numbers of these kinds, such as tortuosity_1 and tortuosity_2 for tortuosity.
+
+    Raises:
+        UsageError: no number has such a name.
+    """
+    import numpy as np
+
+    from splatline_structure.numbers import Rules, structure_of
+
+    known = structure_of(  # of an empty volume, for the names of the numbers
+        np.zeros((2, 2, 2), np.float32), np.arange(1.0, materials), (1, 1, 1), Rules(materials, 1)
+    ).numbers
+    known_of = {kind: [each for each in known if f"{each}_".startswith(f"{kind}_")] for kind in kinds}
+    if unknown := [kind for kind, each in known_of.items() if not each]:
+        raise click.UsageError(
+            f"--number {unknown[0]}: expected a kind of numbers, such as tortuosity, or one of {', '.join(known)}."
+        )
+    return tuple(dict.fromkeys(chain(*known_of.values())))
+
+
+def _measured_by_views(
+    scan: Path, views: list[int], method: str, materials: int, answer: Answer
+) -> dict[int, Mapping[str, Interval]]:
+    """The numbers of the scan, each with its interval, by the number of projections.
+
+    The rotation axis and the box are those that the most projections give.
+
+    Raises:
+        DataError: the scan does not state the pixel size, or a volume cannot be measured.
+    """
+    from beamline.api import Selection, reconstruct
+    from splatline_structure.measuring import measured
+    from splatline_structure.particles import NECK
+    from splatline_structure.volumes import ReadSlices, box_in
+
+    values: dict[str, Any] = {
+        "materials": materials, "particles": None, "parts": None, "scan": scan, "quick": False,
+        "radius": 1, "smallest": 27, "neck": NECK, "side": 96, "through": 1,
+    }  # fmt: skip
+    series: dict[int, Mapping[str, Interval]] = {}
+    tell, axis_col, box = answer.counting("reconstructing with fewer projections"), None, None
+    for done, n in enumerate(sorted(views, reverse=True)):
+        tell(done, len(views))
+        record = reconstruct(scan, method, views=f"fixed:{n}", selection=Selection(axis_col=axis_col), say=None)
+        if record.length_unit != "mm":
+            raise DataError(
+                f"{scan} does not state the pixel size. Make a copy that states it: `beamline ingest {scan} "
+                "COPY.h5 --pixel-size-um SIZE`. Nothing was written."
+            )
+        axis_col = record.axis_col
+        try:
+            box = box or box_in(record.volume.data, "square")
+            slices = slice(0, record.grid.shape[0])
+            read = ReadSlices(record, slices, slices, slices.stop)
+            series[n] = measured(scan, read, box, answer, **values).found.intervals
+        except ValueError as error:
+            raise DataError(f"{scan} cannot be measured with {n} projections: {error}. Nothing was written.") from error
+    return series

@@ -23,6 +23,7 @@ from beamline.core.text import rounded, size
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.views import select
 from beamline.storage.readers.open import open_scan, scan_format
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import opened_volume
 from recon import Grid, Volume
 from recon.post import clusters
@@ -83,50 +84,14 @@ def read_volume(
         DataError: the file is not a volume of finite numbers, does not state the voxel size or has no such slices; or
             fewer than 8 slices fit the memory (with `whole`: fewer than all that were asked for).
     """
-    if dataset is None and path.is_file() and h5py.is_hdf5(path) and (scan := scan_format(path)) is not None:
-        raise DataError(
-            f"Reconstruct {path} with `beamline recon` first: it is a scan ({scan}). If the file does contain a "
-            "volume, give --dataset. Nothing was written."
-        )
-    if zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as packed:
-            unpacked = sum(each.file_size for each in packed.infolist())
-        if unpacked > memory:
-            raise DataError(
-                f"{path}: not enough memory. The unpacked volume has {size(unpacked)}, and {size(memory)} are "
-                "allowed. Give more --memory, or save the volume as .npy (numpy.save), which is read slice by slice. "
-                "Nothing was written."
-            )
+    _require_volume(path, dataset, memory)
     with opened_volume(path, dataset) as record:
-        grid = record.volume.grid
-        if voxel_um is None and record.length_unit != "mm":
-            raise DataError(
-                f"Give --voxel-um EDGE, or Z:Y:X if voxels are not cubes: {path} does not state the voxel size. "
-                "Nothing was written."
-            )
-        if voxel_um is not None:
-            if record.length_unit == "mm" and not np.allclose(voxel_um, stated := 1e3 * np.array(grid.spacing), 0.01):
-                warn(
-                    f"{path} states voxels with edges (z, y, x) of {_edges(stated)} µm, but the edges of --voxel-um "
-                    f"are used: {_edges(voxel_um)} µm. Leave out --voxel-um to use the edges that the file states."
-                )
-            grid = Grid(grid.shape, voxel_um[2] * 1e-3, slice_pitch=voxel_um[0] * 1e-3)
+        grid = _grid_in_mm(path, record, voxel_um, warn)
         n_slices = grid.shape[0]
         first, end = slices or (0, n_slices)
         if not 0 <= first < end <= n_slices:
             raise DataError(f"--slices {first} {end}: {path} has slices 0 to {n_slices}. Nothing was written.")
-        bytes_a_voxel = BYTES_OF_ALL if crop == "none" else BYTES_OF_SQUARE
-        most = (memory // math.prod(grid.shape[1:]) - BYTES_BESIDE) // bytes_a_voxel
-        least = end - first if whole else min(end - first, _LEAST)
-        if most < least:
-            needed = rounded((bytes_a_voxel * least + BYTES_BESIDE) * math.prod(grid.shape[1:]), up=True)
-            raise DataError(
-                f"{path}: not enough memory. {least} slices of {grid.shape[1]} x {grid.shape[2]} voxels need "
-                f"{size(needed)}, and {size(memory)} are allowed{' for each of several volumes' if whole else ''}. "
-                "Free memory, give more "
-                f"--memory{', fewer --slices' if whole else ''}{', --crop square' if crop == 'none' else ''}, or "
-                "measure a part of the volume (`recon --roi`, then --parts or --quick). Nothing was written."
-            )
+        most = _most_slices(path, grid, end - first, memory, crop, whole)
         excess = max(end - first - most, 0)
         fitting = slice(first + excess // 2, end - (excess - excess // 2))
         limit_sentence = (
@@ -150,6 +115,63 @@ def read_volume(
             )
         record = replace(record, volume=Volume(values, grid), length_unit="mm", deviation=None, series=None)
         return ReadSlices(record, fitting, slice(first, end), n_slices, limit_sentence)
+
+
+def _require_volume(path: Path, dataset: str | None, memory: int) -> None:
+    """Raise DataError if the file is a scan, or a packed volume that would not fit the memory."""
+    if dataset is None and path.is_file() and h5py.is_hdf5(path) and (scan := scan_format(path)) is not None:
+        raise DataError(
+            f"Reconstruct {path} with `beamline recon` first: it is a scan ({scan}). If the file does contain a "
+            "volume, give --dataset. Nothing was written."
+        )
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as packed:
+            unpacked = sum(each.file_size for each in packed.infolist())
+        if unpacked > memory:
+            raise DataError(
+                f"{path}: not enough memory. The unpacked volume has {size(unpacked)}, and {size(memory)} are "
+                "allowed. Give more --memory, or save the volume as .npy (numpy.save), which is read slice by slice. "
+                "Nothing was written."
+            )
+
+
+def _grid_in_mm(path: Path, record: ReconRecord, voxel_um: Spacing | None, warn: Callable[[str], None]) -> Grid:
+    """The grid of a volume with spacings in mm: those of `voxel_um`, otherwise those that the file states."""
+    grid = record.volume.grid
+    if voxel_um is None:
+        if record.length_unit != "mm":
+            raise DataError(
+                f"Give --voxel-um EDGE, or Z:Y:X if voxels are not cubes: {path} does not state the voxel size. "
+                "Nothing was written."
+            )
+        return grid
+    if record.length_unit == "mm" and not np.allclose(voxel_um, stated := 1e3 * np.array(grid.spacing), 0.01):
+        warn(
+            f"{path} states voxels with edges (z, y, x) of {_edges(stated)} µm, but the edges of --voxel-um "
+            f"are used: {_edges(voxel_um)} µm. Leave out --voxel-um to use the edges that the file states."
+        )
+    return Grid(grid.shape, voxel_um[2] * 1e-3, slice_pitch=voxel_um[0] * 1e-3)
+
+
+def _most_slices(path: Path, grid: Grid, wanted: int, memory: int, crop: Crop, whole: bool) -> int:
+    """Number of slices of which the measurement fits the memory. Arguments as for `read_volume`.
+
+    Raises:
+        DataError: fewer than 8 slices fit (with `whole`: fewer than `wanted`).
+    """
+    bytes_a_voxel = BYTES_OF_ALL if crop == "none" else BYTES_OF_SQUARE
+    most = (memory // math.prod(grid.shape[1:]) - BYTES_BESIDE) // bytes_a_voxel
+    least = wanted if whole else min(wanted, _LEAST)
+    if most < least:
+        needed = rounded((bytes_a_voxel * least + BYTES_BESIDE) * math.prod(grid.shape[1:]), up=True)
+        raise DataError(
+            f"{path}: not enough memory. {least} slices of {grid.shape[1]} x {grid.shape[2]} voxels need "
+            f"{size(needed)}, and {size(memory)} are allowed{' for each of several volumes' if whole else ''}. "
+            "Free memory, give more "
+            f"--memory{', fewer --slices' if whole else ''}{', --crop square' if crop == 'none' else ''}, or "
+            "measure a part of the volume (`recon --roi`, then --parts or --quick). Nothing was written."
+        )
+    return most
 
 
 def _edges(spacing: ArrayLike) -> str:

@@ -95,15 +95,33 @@ def test_trials_that_were_ended_prefer_nothing() -> None:
     assert preferred_strength(lambda _: np.full(5, np.inf), 3.0) is None
 
 
-def test_a_choice_names_the_best_and_what_chance_does_not_tell_from_it() -> None:
-    def verdicts(*residuals: NDArray[np.float64], least_gain: float = 0.0) -> list[str]:
-        given = (Prediction("", each.tolist()) for each in residuals)
-        return TrialChoice("", least_gain, tuple(given)).verdicts
+@pytest.mark.parametrize(
+    ("gain", "scatter", "costs_little", "least_gain", "taken"),
+    [
+        (0.008, 0.001, True, 0.02, "pnp"),
+        (0.008, 0.001, False, 0.02, "tv"),  # as a Gaussian fit, which takes several times as long
+        (0.004, 0.0001, True, 0.02, "tv"),  # less than a quarter of 2 %
+        (0.018, 0.02, True, 0.02, "tv"),  # 2.1 standard errors
+        (0.018, 0.0001, True, 0.1, "tv"),  # less than a quarter of 10 %
+        (0.018, 0.02, True, 0.0, "pnp"),
+    ],
+)
+def test_a_small_but_certain_gain_suffices_for_a_candidate_that_costs_little(
+    gain: float, scatter: float, costs_little: bool, least_gain: float, taken: str
+) -> None:
+    by_view = scatter * np.array([-1.0, 1.0, -1.0, 1.0, 0.0])  # standard error of the mean: scatter / √5
+    choice = TrialChoice("16 rows", least_gain).after(Prediction("tv", (1 + SCATTER).tolist()))
+    choice = choice.after(Prediction("pnp", (1 - gain + by_view + SCATTER).tolist(), costs_little=costs_little))
+    assert choice.chosen is not None and choice.predictions[choice.chosen].name == taken
+    certain = "or by 0.5% and by more than 4 standard errors"
+    assert (certain in choice.reason) is (taken == "tv" and costs_little and least_gain == 0.02)
 
-    ended = np.full(5, np.inf)
-    assert verdicts(1.2 + SCATTER, 1 + SCATTER, 1.01 - SCATTER, ended) == ["", "best", "alike", ""]
-    assert verdicts(1.04 + SCATTER, 1 + SCATTER, least_gain=0.05) == ["", ""]  # the best lowers none by so much
-    assert verdicts(ended) == [""]
+
+def test_a_costly_candidate_with_a_lower_residual_does_not_hide_a_certain_gain() -> None:
+    choice = TrialChoice("16 rows").after(Prediction("tv", (1 + SCATTER).tolist()))
+    choice = choice.after(Prediction("pnp", (0.99 + SCATTER).tolist(), costs_little=True))
+    assert choice.after(Prediction("r2", (0.985 + SCATTER).tolist())).chosen == 1  # r2: 0.5 % below pnp
+    assert choice.after(Prediction("r2", (0.9 + SCATTER).tolist())).chosen == 2
 
 
 def test_a_choice_says_why_the_lowest_residual_is_not_taken() -> None:
@@ -167,6 +185,6 @@ def test_a_choice_is_the_same_from_a_file() -> None:
     assert choice.reason.endswith("fista-tv 2.000; r2 1.000; fbp: not these; r2 stopped")
     again = TrialChoice.of(json.loads(json.dumps(choice)))
     assert (again.chosen, again.reason) == (choice.chosen, choice.reason)
-    assert again.predictions[1].prior == Prior(0.1)
+    assert again.predictions == choice.predictions
     assert again.best_residuals is not None and again.best_residuals.mean() == pytest.approx(1.0)
     assert TrialChoice("no views").chosen is None and TrialChoice("no views").reason == "no views"
