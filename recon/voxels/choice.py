@@ -191,6 +191,20 @@ class TrialChoice(NamedTuple):
         return next(number for number, by_view in residuals.items() if not is_beaten(by_view))
 
     @property
+    def verdicts(self) -> list[str]:
+        """For each candidate "best", or "alike" if it predicts equally well within chance, or "".
+
+        All are empty if the best candidate does not lower any other residual by `least_gain`."""
+        residuals, best_residuals, words = self.residuals_by_number, self.best_residuals, [""] * len(self.predictions)
+        if best_residuals is None or all(
+            (1 - self.least_gain) * each.mean() <= best_residuals.mean() for each in residuals.values()
+        ):
+            return words
+        for number, each in residuals.items():
+            words[number] = "best" if number == self.best else "alike" * predicts_as_well(each, best_residuals)
+        return words
+
+    @property
     def prior(self) -> Prior | None:
         """The prior of the chosen candidate."""
         return None if self.chosen is None else self.predictions[self.chosen].prior

@@ -124,6 +124,17 @@ def test_a_costly_candidate_with_a_lower_residual_does_not_hide_a_certain_gain()
     assert choice.after(Prediction("r2", (0.9 + SCATTER).tolist())).chosen == 2
 
 
+def test_a_choice_names_the_best_and_what_chance_does_not_tell_from_it() -> None:
+    def verdicts(*residuals: NDArray[np.float64], least_gain: float = 0.0) -> list[str]:
+        given = (Prediction("", each.tolist()) for each in residuals)
+        return TrialChoice("", least_gain, tuple(given)).verdicts
+
+    ended = np.full(5, np.inf)
+    assert verdicts(1.2 + SCATTER, 1 + SCATTER, 1.01 - SCATTER, ended) == ["", "best", "alike", ""]
+    assert verdicts(1.04 + SCATTER, 1 + SCATTER, least_gain=0.05) == ["", ""]  # the best lowers none by so much
+    assert verdicts(ended) == [""]
+
+
 def test_a_choice_says_why_the_lowest_residual_is_not_taken() -> None:
     def reason(gain: float, least_gain: float, scatter: NDArray[np.float64] = 0 * SCATTER) -> str:
         given = (Prediction(name, left.tolist()) for name, left in (("tv", 1 + scatter), ("r2", 1 - gain - scatter)))
