@@ -78,8 +78,8 @@ class Prediction(NamedTuple):
         prior: the prior of the candidate's volume, which is used again for the volume from all projections. None: the
             candidate has no prior, or chooses it again.
         remark: the reason why the candidate was not tried or was stopped early; may be empty.
-        costs_little: whether the candidate takes at most about twice as long as simpler iterative candidates. Then a
-            small but certain gain suffices.
+        costs_little: whether the candidate takes at most about three times as long as total variation. Then a small but
+            certain gain suffices.
     """
 
     name: str

@@ -23,7 +23,6 @@ from beamline.core.text import rounded, size
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.views import select
 from beamline.storage.readers.open import open_scan, scan_format
-from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import opened_volume
 from recon import Grid, Volume
 from recon.post import clusters
@@ -135,7 +134,7 @@ def _require_volume(path: Path, dataset: str | None, memory: int) -> None:
             )
 
 
-def _grid_in_mm(path: Path, record: ReconRecord, voxel_um: Spacing | None, warn: Callable[[str], None]) -> Grid:
+def _grid_in_mm(path: Path, record: Any, voxel_um: Spacing | None, warn: Callable[[str], None]) -> Grid:
     """The grid of a volume with spacings in mm: those of `voxel_um`, otherwise those that the file states."""
     grid = record.volume.grid
     if voxel_um is None:
