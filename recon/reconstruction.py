@@ -81,9 +81,9 @@ def reconstruct(
             cannot use the projections, the held-out projections, the device or the checkpoint.
 
     Warns:
-        UserWarning: values with a weight are not finite, angles look like degrees, the projections look like counts,
-        like transmission or like line integrals of the wrong sign, or densities are uncertain because a
-        part of the turn has no projections.
+        UserWarning: values whose weight is not 0 are not finite; the angles look like degrees; the projections look
+            like counts, transmission, or line integrals of the wrong sign; densities are uncertain, because a part of
+            the turn has no projections.
     """
     projections = without_mask(projections)
     check_arguments(reconstruct, locals())

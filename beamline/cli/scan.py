@@ -44,7 +44,7 @@ class ScanRequest:
         "--dry-run",
         is_flag=True,
         help="Print the timeline, limits and free disk space, and stop. No device is used. "
-        "With several scans: print which of them can run, all faults, and what they need.",
+        "With several scans: print for each scan whether it can run, its size, time and dose, and all faults.",
     )
     overrides: tuple[str, ...] = set_by(set_option)
     rehearse: bool = set_by(

@@ -151,11 +151,11 @@ class BeamMonitorSection(Section):
         1.0, "Time in s between two readings during a scan. The readings are stored in the scan file.", gt=0, le=1e6
     )
     pause_below: float | None = setting(
-        None, "Reading below which the scan pauses, in the unit of the key `unit`; null: the scan never pauses.", gt=0
+        None, "The scan pauses if the reading falls below this value, in the unit of the key `unit`; null: never.", gt=0
     )
     resume_above: float | None = setting(
         None,
-        "Reading at or above which a paused scan continues, in the unit of the key `unit`; null: 1.1 times "
+        "A paused scan continues when the reading reaches this value, in the unit of the key `unit`; null: 1.1 times "
         "pause_below.",
         gt=0,
     )

@@ -141,7 +141,7 @@ class MotionCheck(Logged):
 
     alarm: float = setting(0.5, "largest allowed shift of the sample between two projections, in pixels", ge=0)
     steps: float = setting(
-        3.0, "largest allowed error of the rotation between two projections in a row, in angular steps", ge=0
+        3.0, "largest allowed error of the rotation from one projection to the next, in angular steps", ge=0
     )
     shake: float = setting(0.25, "largest allowed shaking of the sample, in pixels (standard deviation)", ge=0)
 

@@ -118,8 +118,8 @@ def photons_of(scan: SelectedScan, references: References) -> Photons | None:
             if model.noise == "auto":
                 return None
             raise ConfigError(
-                "Give --gain COUNTS for --noise counts, because the counts per photon could not be found "
-                f"in {source.path}: {error}."
+                "--noise counts needs the counts per photon. Give them with --gain COUNTS, because they could not be "
+                f"found in {source.path}: {error}."
             ) from error
     # one count of a mean over n frames also stands for n times as many photons; flats and darks are single frames
     photons = Photons(photons.gain / source.frames_per_view, photons.variance / source.frames_per_view)

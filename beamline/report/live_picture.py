@@ -136,9 +136,8 @@ def reference_row(shown: Preview, n_views: int, unit: str) -> PictureRow:
     (moved, volume, change), zoom = _sized((moved, volume, change))
     grey = f"{window[0]:.3g} to {window[1]:.3g} 1/{unit}"
     heading = (
-        f"The moved reference, and FBP of the residual of {n_views} projections (residual: {shown.left:.1%} of their "
-        f"norm; "
-        "the smaller, the better the reference fits)"
+        f"The reference, moved to where the sample is now, and FBP of what it does not explain in {n_views} "
+        f"projections ({shown.left:.1%} of the norm of the projections; the smaller, the better the reference fits)"
     )
     panels = [
         _Panel(moved, window, "the moved reference, x → y ↓", grey, (grid.voxel_size / zoom, unit)),

@@ -26,8 +26,8 @@ class Gaussians:
     2024).
 
     With a kernel f other than exp(-q/2), the elements of the sum are still called Gaussians, and S still contains their
-    standard deviations. A density is a multiple of the density unit, and its raw density sets only the multiple.
-    Therefore raw densities and their learning rates do not depend on the unit of length.
+    standard deviations. The density of a Gaussian is a factor times `density_unit`. A raw density determines
+    this factor, so raw densities and their learning rates do not depend on the unit of length.
 
     Attributes:
         means: [n, 3] mm, (x, y, z).

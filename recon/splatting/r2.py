@@ -42,7 +42,8 @@ class R2(Fit):
     Attributes:
         steps: number of steps; 0: the result is the starting point; None: 400 steps, or, if `seconds` is given, as many
             steps as the time allows.
-        seconds: time limit of the whole run by the caller's clock: start, steps, voxel refinement and volume.
+        seconds: time limit of the whole run, which consists of the start, the steps, the voxel refinement and the
+            volume. The time is that of `RunControl.now`.
         gaussians: number of Gaussians at the start, or the Gaussians to start from; None: a number derived from the
             detector.
         start: volume from which the first Gaussians are sampled, see `initialise.first_volume`.

@@ -71,7 +71,7 @@ class Basis(Enum):
     NUMBERS = "the frame whose number is one above that of the last frame before the block"
     COUNTER = "the frame with the number that was calculated from the camera's counter"
     WAITED = "the first frame that arrived"
-    UNKNOWN = "the first frame that arrived, although earlier frames may be lost"
+    UNKNOWN = "the first frame that arrived (frames before it may have been lost)"
 
     @property
     def is_sure(self) -> bool:

@@ -212,7 +212,9 @@ class Discrete(HalfVoxels):
         self, problem: VoxelProblem, x: F32, weight: TvWeight, materials: MaterialPrior, done: int,
         to_the_end: bool = True,
     ) -> F32:  # fmt: skip
-        """Continue from the volume x [y, x, z], with a pull to the grey levels, and return the new volume [y, x, z].
+        """Iterate further from a volume [y, x, z], pull its voxels to the grey levels, and return the new volume
+        [y, x, z].
+
         The function makes at most `iterations` iterations. `done` is the number of iterations that the method made
         before; the reported progress counts on from this number. `to_the_end` is explained in `Subsets.of`.
         """

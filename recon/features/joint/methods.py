@@ -152,6 +152,6 @@ def _because(without_motion: float, with_motion: float, moves: bool) -> str:
     if moves or with_motion >= without_motion:
         return f"{'motion' if moves else 'no motion'}, because {judged}"
     return (
-        "if the sample moved, make a second volume with --moves, and compare it with this volume. This volume has "
-        f"no motion, because the lower residual with motion may be chance: {judged}"
+        "if the sample moved, make a second volume with --moves, and compare it with this volume. This volume was made "
+        f"without motion: {judged}, but a difference as small as this may be chance"
     )
