@@ -121,15 +121,15 @@ class Auto(Method):
         return self._with_half_voxels(choice, problem, trial), trial
 
     def _with_half_voxels(self, choice: TrialChoice, problem: ReconProblem, trial: Trial) -> TrialChoice:
-        """The choice, with the result of the test of half voxels if the chosen candidate would use them."""
+        """The choice, with the weight of half voxels if the chosen candidate would use them."""
         assert choice.chosen is not None
         chosen, prior = self.candidates[choice.chosen], choice.prior
         if prior is None or not isinstance(chosen, HalfVoxels) or not chosen.halves(problem.geometry, problem.grid):
             return choice
         units, weighed = trial.problem.units, trial.problem.weight is not None
         with threads_for(problem.grid):
-            wanted = chosen.half_voxels_predict(trial, units.prior(prior, weighed))
-        return choice.with_prior(prior._replace(half_voxels=wanted))
+            weight = chosen.best_half_voxel_weight(trial, units.prior(prior, weighed))
+        return choice.with_prior(prior._replace(half_voxel_weight=weight))
 
     @property
     def alternatives(self) -> tuple[Method, ...]:

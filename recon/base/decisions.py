@@ -43,20 +43,21 @@ class Prior(NamedTuple):
         strength: last threshold of the patch-based denoiser (PnP-DCT); 0: PnP-DCT was not tried.
         patches: PnP-DCT predicts held-out projections better than total variation alone.
         materials: discrete levels that voxels are pulled to; None: levels were not searched for.
-        half_voxels: half voxels predict held-out projections as well as whole voxels; None: not tested.
+        half_voxel_weight: weight of total variation on half voxels, divided by that on whole voxels; 0: half voxels
+            predict held-out projections worse, and are not used; None: not tested.
     """
 
     weight: float
     strength: float = 0.0
     patches: bool = False
     materials: MaterialPrior | None = None
-    half_voxels: bool | None = None
+    half_voxel_weight: float | None = None
 
     @classmethod
     def of(cls, values: Sequence[Any]) -> Prior:
         """A prior, or its values from a file."""
-        weight, strength, patches, materials, half_voxels = values
-        return cls(weight, strength, patches, materials and MaterialPrior(*materials), half_voxels)
+        weight, strength, patches, materials, half_voxel_weight = values
+        return cls(weight, strength, patches, materials and MaterialPrior(*materials), half_voxel_weight)
 
 
 class IterationEnd(NamedTuple):

@@ -18,7 +18,7 @@ from recon.base.setting import Count, Natural, NonNegative
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.choice import TRIALS, Prediction, TrialChoice
-from recon.voxels.half_voxels import HalfVoxels, with_halves
+from recon.voxels.half_voxels import WEIGHTS, HalfVoxels, with_halves
 from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_SWEEPS
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
 from recon.voxels.ordered_fista import MANY_SUBSETS, SUBSETS, Subsets, ordered_fista, subsets_of
@@ -104,10 +104,18 @@ class FistaTv(HalfVoxels):
             return self.with_weight(problem, x)[0]
         trial = cache(partial(Trial.of, problem))
         x, weight = self.with_weight(problem, x, trial)
-        if not problem.go_on.going or not self.uses_halves(problem, Prior(weight.value), trial):
+        if not problem.go_on.going:
+            return x
+        on_halves = self.half_voxel_weight(problem, Prior(weight.value), trial)
+        if not on_halves:
             return x
         trial.cache_clear()
-        return self.in_half_voxels(problem, x, weight.value, self.tv_steps)
+        return self.in_half_voxels(problem, x, on_halves * weight.value, self.tv_steps)
+
+    @property
+    def half_voxel_weights(self) -> tuple[float, ...]:
+        """A weight that the caller gives is the weight on half voxels, too."""
+        return WEIGHTS if self.tv_weight is None else WEIGHTS[:1]
 
     def with_weight(
         self, problem: VoxelProblem, x: F32, trial: Callable[[], Trial | None] | None = None

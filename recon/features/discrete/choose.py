@@ -22,7 +22,7 @@ from recon.features.discrete.mixture import (
     thin_parts,
 )
 from recon.voxels.choice import LEAST_GAIN, significantly_better
-from recon.voxels.half_voxels import half_voxels_predict
+from recon.voxels.half_voxels import LARGEST_LOSS_WITH_LEVELS, WEIGHTS, best_half_voxel_weight
 from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem
 
@@ -149,10 +149,11 @@ class MaterialTrial:
             return best, fewer
         return None
 
-    def half_voxels_predict(self, materials: MaterialPrior) -> bool:
-        """Whether half voxels with these levels predict held-out projections as well as whole voxels."""
+    def best_half_voxel_weight(self, materials: MaterialPrior) -> float:
+        """`best_half_voxel_weight` for a volume with these levels."""
         whole, weight = self._as_made(materials), self._weight * materials.tv_share
-        return half_voxels_predict(self._trial, whole, weight, partial(pull_to, materials))
+        pull = partial(pull_to, materials)
+        return best_half_voxel_weight(self._trial, whole, weight, WEIGHTS, LARGEST_LOSS_WITH_LEVELS, pull)
 
     def _is_better(self, materials: MaterialPrior) -> bool:
         """Whether a volume as it will be made with these levels predicts better than total variation."""

@@ -169,27 +169,28 @@ class Discrete(HalfVoxels):
         if not problem.go_on.going:
             return x
         if materials is None:
-            if not without_levels.uses_halves(problem, Prior(mu), trial):
-                return x
-            return without_levels.in_half_voxels(problem, x, mu, TV_STEPS)
+            on_halves = without_levels.half_voxel_weight(problem, Prior(mu), trial)
+            return without_levels.in_half_voxels(problem, x, on_halves * mu, TV_STEPS) if on_halves else x
         sweeps_before = 0 if problem.decide.ended is None else problem.decide.ended.after
         x = self.pulled(problem, x, weight, materials, self.first_sweeps)
         if (ended := problem.decide.ended) is not None:
             problem.decide.ended = ended._replace(after=sweeps_before + ended.after)
-        if not problem.go_on.going or not self.uses_halves(problem, Prior(mu, materials=materials), trial):
+        if not problem.go_on.going:
+            return x
+        on_halves = self.half_voxel_weight(problem, Prior(mu, materials=materials), trial)
+        if not on_halves:
             return x
         pull = partial(pull_to, materials)
         return self.in_half_voxels(
-            problem, x, mu * materials.tv_share, TV_STEPS, pull, self.first_sweeps - sweeps_before
+            problem, x, on_halves * mu * materials.tv_share, TV_STEPS, pull, self.first_sweeps - sweeps_before
         )
 
-    def half_voxels_predict(self, trial: Trial, prior: Prior) -> bool:
-        """Whether half voxels predict held-out projections as well as whole voxels, with these levels if there are
-        any."""
+    def best_half_voxel_weight(self, trial: Trial, prior: Prior) -> float:
+        """As for other methods, with these levels if there are any."""
         materials = prior.materials
         if materials is None or not materials.levels:
-            return super().half_voxels_predict(trial, prior)
-        return MaterialTrial(trial, prior.weight, self.iterations, materials.levels).half_voxels_predict(materials)
+            return super().best_half_voxel_weight(trial, prior)
+        return MaterialTrial(trial, prior.weight, self.iterations, materials.levels).best_half_voxel_weight(materials)
 
     def materials(
         self, problem: VoxelProblem, weight: TvWeight, trial: Callable[[], Trial | None]

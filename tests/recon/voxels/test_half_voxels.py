@@ -21,8 +21,10 @@ from recon.voxels.choice import TrialChoice
 from recon.voxels.half_voxels import (
     COST,
     HALVES,
+    LARGEST_LOSS,
+    WEIGHTS,
     HalfVoxels,
-    half_voxels_predict,
+    best_half_voxel_weight,
     halved,
     uses_half_voxels,
     with_halves,
@@ -175,11 +177,37 @@ def test_they_are_rejected_if_whole_voxels_predict_better() -> None:
     geometry = geometry_of(20)
     volume = np.repeat(truth()[None], ROWS, 0).astype(np.float32)
     exact = trial_of(recon.Projector(geometry, Grid.matching(geometry)).forward(volume), geometry)
-    assert not half_voxels_predict(exact, exact.lines_of(Volume(volume, Grid.matching(geometry))), 1e-3)
+    whole = exact.lines_of(Volume(volume, Grid.matching(geometry)))
+    assert best_half_voxel_weight(exact, whole, 1e-3, WEIGHTS[:1], LARGEST_LOSS) == 0
+    assert best_half_voxel_weight(exact, whole, 1e-2, WEIGHTS, LARGEST_LOSS) == 0
     noisy = np.random.default_rng(1).normal(exact_views(geometry), 0.01).astype(np.float32)
     trial = trial_of(noisy, geometry)
     assert trial.weight is not None
-    assert recon.FistaTv().half_voxels_predict(trial, Prior(trial.weight))
+    assert recon.FistaTv().best_half_voxel_weight(trial, Prior(trial.weight)) == 1
+
+
+def test_a_smaller_weight_is_tested_before_they_are_rejected() -> None:
+    """With a smaller weight, half voxels explain these exact projections, too."""
+    geometry = geometry_of(20)
+    volume = np.repeat(truth()[None], ROWS, 0).astype(np.float32)
+    exact = trial_of(recon.Projector(geometry, Grid.matching(geometry)).forward(volume), geometry)
+    whole = exact.lines_of(Volume(volume, Grid.matching(geometry)))
+    assert 0 < best_half_voxel_weight(exact, whole, 1e-3, WEIGHTS, LARGEST_LOSS) < 1
+    assert recon.FistaTv(tv_weight=1e-3).half_voxel_weights == (1,)  # the weight of the caller is kept
+
+
+def test_the_weight_on_half_voxels_is_a_share_of_that_on_whole_voxels() -> None:
+    geometry, decide = geometry_of(20), Decisions()
+    views = np.random.default_rng(1).normal(exact_views(geometry), 0.01).astype(np.float32)
+    method = recon.FistaTv(tv_weight=1e-3)
+    recon.reconstruct(views, geometry, method, control=RunControl(decide=decide))
+
+    def variation(share: float) -> float:
+        control = RunControl(decide=Decisions(0, {**decide.made, HALVES: [share]}))
+        volume = recon.reconstruct(views, geometry, method, control=control).volume.data
+        return float(np.abs(np.diff(volume, axis=1)).sum() + np.abs(np.diff(volume, axis=2)).sum())
+
+    assert variation(0.35) > 1.02 * variation(1)
 
 
 @pytest.mark.parametrize("method", [recon.FistaTv(), recon.Discrete(), recon.Auto()])
@@ -187,8 +215,8 @@ def test_the_decision_is_made_once_and_followed(method: recon.FistaTv | recon.Di
     geometry, decide = geometry_of(20), Decisions()
     views = np.random.default_rng(1).normal(exact_views(geometry), 0.01).astype(np.float32)
     used = recon.reconstruct(views, geometry, method, control=RunControl(decide=decide))
-    assert decide.made[HALVES] == [True] and used.settings["half_voxel_iterations"] > 0
-    control = RunControl(decide=Decisions(0, {**decide.made, HALVES: [False]}))
+    assert decide.made[HALVES] == [1] and used.settings["half_voxel_iterations"] > 0
+    control = RunControl(decide=Decisions(0, {**decide.made, HALVES: [0]}))
     assert "half_voxel_iterations" not in recon.reconstruct(views, geometry, method, control=control).settings
 
 
@@ -197,9 +225,9 @@ def test_auto_tests_them_for_the_method_that_it_chose() -> None:
     views = np.random.default_rng(1).normal(exact_views(geometry), 0.01).astype(np.float32)
     problem = ReconProblem(Views(views, geometry), Grid.matching(geometry))
     choice = recon.Auto().choose(problem, RunControl())
-    assert choice.prior is not None and choice.prior.half_voxels is True
+    assert choice.prior is not None and choice.prior.half_voxel_weight == 1
     never = recon.Auto().with_quality("preview", 0).choose(problem, RunControl())
-    assert never.prior is not None and never.prior.half_voxels is None
+    assert never.prior is not None and never.prior.half_voxel_weight is None
 
 
 def test_a_stop_leaves_them_out() -> None:

@@ -82,8 +82,8 @@ def test_with_levels_half_voxels_are_tested_for_more_than_a_third_as_many_projec
     """These projections were computed from whole voxels, so half voxels predict them worse."""
     views, decide = measured(grains(), MORE_VIEWS), Decisions()
     tested = recon.reconstruct(views, MORE_VIEWS, recon.Discrete(), control=RunControl(decide=decide))
-    assert decide.made[HALVES] == [False] and "half_voxel_iterations" not in tested.settings
-    as_if_passed = RunControl(decide=Decisions(0, {**decide.made, HALVES: [True]}))
+    assert decide.made[HALVES] == [0] and "half_voxel_iterations" not in tested.settings
+    as_if_passed = RunControl(decide=Decisions(0, {**decide.made, HALVES: [1]}))
     result = recon.reconstruct(views, MORE_VIEWS, recon.Discrete(), control=as_if_passed)
     assert result.settings["half_voxel_iterations"] > 0 and not result.chosen
 
