@@ -66,7 +66,7 @@ class FieldOfViewCheck(Logged):
     meaning: ClassVar[str] = "a part of the frame gets no beam even without a sample"
 
     unlit: float = setting(
-        0.02, "the check warns if a larger fraction of the pixels of a flat gets no beam", ge=0, lt=1
+        0.02, "the check warns if more than this fraction of the pixels of a flat gets no beam", ge=0, lt=1
     )
     edge: float = setting(LEAST, "line integral at the edges up to which the sample counts as inside", ge=0)
 

@@ -109,8 +109,8 @@ def choose(
     following = next((option for option in allowed if option.choice is Choice.NEXT), best)
     taken = following if best.low / best.seconds <= following.high / following.seconds else best
     return taken.choice, (
-        f"{taken.gain:.2f} dB ({taken.low:.2f} to {taken.high:.2f}) in {taken.seconds:.0f} s; no other choice is "
-        "significantly better per second"
+        f"{taken.gain:.2f} dB ({taken.low:.2f} to {taken.high:.2f}) in {taken.seconds:.0f} s; no other choice gains "
+        "significantly more dB per second"
     )
 
 

@@ -23,11 +23,12 @@ LEAST_GAIN = 0.02
 (On a scan of a tooth, a fit lowers the residual by 1.3 % and takes four times as long.)
 """
 
-_SURE_SHARE, _SURE_ERRORS = 0.25, 4.0
-"""A candidate that costs little more than the simpler ones is also chosen for a small but certain gain: for this share
-of `LEAST_GAIN`, if the gain exceeds this number of standard errors.
+_SURE_SHARE, _SURE_ERRORS, _SURE_VIEWS = 0.25, 4.0, 5
+"""A candidate that costs little more than the chosen one replaces it for a small but certain gain: for this share of
+`LEAST_GAIN`, if the gain exceeds this number of standard errors, with at least this number of held-out projections.
 
-(PnP-DCT instead of total variation, see docs/decisions/voxels.md.)
+(PnP-DCT instead of total variation, see docs/decisions/voxels.md. A standard error of two or three projections says
+little.)
 """
 
 # name of the measure in the explanation of a choice
@@ -79,7 +80,7 @@ class Prediction(NamedTuple):
             candidate has no prior, or chooses it again.
         remark: the reason why the candidate was not tried or was stopped early; may be empty.
         costs_little: whether the candidate takes at most about three times as long as total variation. Then a small but
-            certain gain suffices.
+            certain gain over a candidate with a prior suffices.
     """
 
     name: str
@@ -179,16 +180,28 @@ class TrialChoice(NamedTuple):
         return levels if residuals[levels].mean() < residuals[other].mean() else other
 
     def _simplest_of(self, residuals: dict[int, F64]) -> int:
-        """Number of the first of these candidates that neither the best of them nor one that costs little beats."""
+        """Number of the first of these candidates that the best does not clearly beat, or of the one that replaces it
+        for a small but certain gain."""
+        simplest = self._first_unbeaten(residuals)
+        if self.predictions[simplest].prior is None:  # such as FBP, which takes much less time
+            return simplest
+        return next(
+            (
+                number
+                for number, each in residuals.items()
+                if self.predictions[number].costs_little
+                and each.size >= _SURE_VIEWS
+                and significantly_better(each, residuals[simplest], _SURE_SHARE * self.least_gain, _SURE_ERRORS)
+            ),
+            simplest,
+        )
+
+    def _first_unbeaten(self, residuals: dict[int, F64]) -> int:
+        """Number of the first of these candidates that the best of them does not beat by `least_gain`."""
         best = min(residuals.values(), key=lambda each: float(each.mean()))
-        cheap = [each for number, each in residuals.items() if self.predictions[number].costs_little]
-
-        def is_beaten(by_view: F64) -> bool:
-            return significantly_better(best, by_view, self.least_gain) or any(
-                significantly_better(each, by_view, _SURE_SHARE * self.least_gain, _SURE_ERRORS) for each in cheap
-            )
-
-        return next(number for number, by_view in residuals.items() if not is_beaten(by_view))
+        return next(
+            number for number, each in residuals.items() if not significantly_better(best, each, self.least_gain)
+        )
 
     @property
     def verdicts(self) -> list[str]:
@@ -229,30 +242,45 @@ class TrialChoice(NamedTuple):
         listed = [f"{name} {mean:#.4g}" for name, mean in means]
         remarks = [each.remark for each in self.predictions if each.remark]
         sentences = "; ".join([*listed, *remarks])
-        return f"test reconstructions of {self.part_of_scan}, {MEASURE}: {sentences}{self._of_the_best}"
+        return f"test reconstructions of {self.part_of_scan}, {MEASURE}: {sentences}{self._certain}{self._of_the_best}"
+
+    @property
+    def _certain(self) -> str:
+        """That the chosen candidate replaced a simpler one for a small but certain gain; empty if it did not."""
+        simplest = self._first_unbeaten(self.residuals_by_number)
+        if self.chosen is None or not self.predictions[self.chosen].costs_little or simplest >= self.chosen:
+            return ""
+        return (
+            f". {self._gain(self.chosen, simplest)}. A gain below {self.least_gain:.0%} suffices here, because it "
+            f"exceeds {_SURE_ERRORS:.0f} standard errors and {self.predictions[self.chosen].name} costs little"
+        )
+
+    def _gain(self, better: int, worse: int) -> str:
+        """Sentence on how much smaller the residual of one candidate is."""
+        ours, theirs = self.residuals_by_number[better], self.residuals_by_number[worse]
+        improvement, error = (
+            value / theirs.mean() for value in ((theirs - ours).mean(), _standard_error(theirs - ours))
+        )
+        return (
+            f"The residual of {self.predictions[better].name} is {improvement:.2%} smaller than the residual of "
+            f"{self.predictions[worse].name} (standard error {error:.2%})"
+        )
 
     @property
     def _of_the_best(self) -> str:
         """By how much the best candidate is better than the simpler chosen one; empty if the best one was chosen."""
         if self.chosen is None or self.best is None or self.chosen == self.best:
             return ""
-        (simple, of_simple), (best, of_best) = (
-            (self.predictions[number].name, self.residuals_by_number[number]) for number in (self.chosen, self.best)
-        )
-        improvement, error = (
-            (of_simple - of_best).mean() / of_simple.mean(),
-            _standard_error(of_simple - of_best) / of_simple.mean(),
-        )
         margin = f"{self.least_gain:.0%} and by more than " if self.least_gain else "more than "
         certain = (
             f", or by {_SURE_SHARE * self.least_gain:.1%} and by more than {_SURE_ERRORS:.0f} standard errors"
-            if self.least_gain and self.predictions[self.best].costs_little
+            if self.least_gain and self.predictions[self.best].costs_little and self.prior is not None
             else ""
         )
         return (
-            f". The residual of {best} is {improvement:.2%} smaller than the residual of {simple} (standard error "
-            f"{error:.2%}). {simple} was chosen, because it is simpler: a costlier method is chosen only if its "
-            f"residual is smaller by {margin}one standard error{certain}"
+            f". {self._gain(self.best, self.chosen)}. {self.predictions[self.chosen].name} was chosen, because it is "
+            f"simpler: a costlier method is chosen only if its residual is smaller by {margin}one standard "
+            f"error{certain}"
         )
 
 

@@ -28,7 +28,7 @@ from recon.base.decisions import Prior
 from recon.base.empirical import ONE_IN, STILL_IN_TRIAL
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.voxels.iterative import VoxelMethod
+from recon.voxels.iterative import HALVES, VoxelMethod
 from recon.voxels.ordered_fista import Prox, Pull, Subsets, ordered_fista, subsets_of
 from recon.voxels.priors import TvWeight, tv_prox
 from recon.voxels.resolution import smoothed
@@ -65,8 +65,6 @@ and 0.4 dB if levels are not rejected; `auto` takes other methods for most of th
 _MOST_COLUMNS, _WIDEST, _LEAST_WIDTH, _AS_WIDE = 1024, 2.2, 0.75, 0.1
 # copies of half-voxel volumes: a quarter for the volume of whole voxels, the rest for the coarse cells of damping
 _MORE_VOLUMES = 0.6
-HALVES = "half_voxel_weight"
-"""Name of the decision on the weight of half voxels, see `Prior.half_voxel_weight`."""
 _TEST_ROWS, _MARGIN_ROWS = 8, 2
 """Number of rows of the test reconstruction with half voxels, and number of rows at each end that do not count.
 
@@ -224,8 +222,8 @@ def uses_half_voxels(wanted: bool | None, geometry: Geometry, grid: Grid, few: f
 def best_half_voxel_weight(
     trial: Trial, whole: F32, mu: float, weights: Sequence[float], largest_loss: float, pull: MakePull | None = None
 ) -> float:
-    """The weight of total variation with which half voxels predict the held-out projections of a trial best, divided by
-    the weight on whole voxels; 0: whole voxels predict better.
+    """The weight of total variation with which half voxels predict the held-out projections of a trial, divided by the
+    weight on whole voxels; 0: they predict worse than whole voxels by more than `largest_loss`.
 
     If half voxels predict worse with the largest weight, smaller weights are tested as long as each lowers the residual
     clearly.
@@ -252,20 +250,20 @@ def best_half_voxel_weight(
 
     first = np.ascontiguousarray(whole[:, :, rows])
     of_whole, best, least = residuals_of(first), weights[0], residuals_of(volume_of(weights[0]))
-    for weight in weights[1:] if least.mean() > of_whole.mean() else ():
+    for weight in () if least.mean() <= of_whole.mean() else weights[1:]:
         residuals = residuals_of(volume_of(weight))
         if not residuals.mean() < (1 - _LEAST_FALL) * least.mean():
             break
         best, least = weight, residuals
-    return best if predict_as_well_as(least, of_whole, largest_loss) else 0.0
+    return best if trial.ended or predict_as_well_as(least, of_whole, largest_loss) else 0.0
 
 
 def predict_as_well_as(halves: F64, whole: F64, largest_loss: float) -> bool:
     """Whether the residuals [held-out view] of half voxels exceed those of whole voxels by at most this share.
 
-    True if the tests were stopped.
+    True if both are infinite, because the tests were stopped.
     """
-    return not halves.mean() > (1 + largest_loss) * whole.mean()
+    return bool(halves.mean() <= (1 + largest_loss) * whole.mean())
 
 
 def on_half_voxels(

@@ -159,7 +159,7 @@ class EarlyTv(FistaTv):
 
 @dataclass(frozen=True)
 class OsSirtTv(VoxelMethod):
-    """Ordered-subset SIRT with a proximal step of total variation and momentum after each iteration.
+    """Ordered-subset SIRT; after each iteration, a proximal step of total variation and a step of momentum.
 
     The iterations end when the volume has converged. The weight of a ray is the inverse of the length of the ray in the
     volume. Long rays usually pass through more material and carry fewer photons. Because long rays have less weight,
@@ -169,7 +169,7 @@ class OsSirtTv(VoxelMethod):
     Fessler (2015, IEEE TMI 34, 167). Memory: 9 volumes and 3 times the projections.
 
     Attributes:
-        iterations: largest number of iterations over all projections.
+        iterations: at most this many iterations; each uses all projections once.
         tv_weight: threshold of the proximal step in density units; None: chosen by held-out projections or from the
             noise, see `choose_weight`.
         still: as in `FistaTv`.
@@ -294,7 +294,7 @@ class PnpDct(VoxelMethod):
             prediction = trial.predicted(self)
         else:
             prediction = trial.prediction(self.name, trial.residuals_of_patches(trial.prior.strength), trial.prior)
-        return prediction._replace(costs_little=True)
+        return prediction._replace(costs_little=self.iterations <= PATCH_STEPS)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         sweeps = 0 if x.any() else self.first_sweeps

@@ -44,7 +44,7 @@ REFUSALS = {
     26: ("parameter missing", CHECK_MODEL),
     27: ("soft limit out of range", CHECK_TRAVEL),
     31: ("the axis has no reference sensor", "Set the key `reference` to a limit switch that the stage has"),
-    32: ("the axis has no limit switches", "Set the key `reference` to the reference switch, if the stage has one"),
+    32: ("the axis has no limit switches", "Set the key `reference` to `switch`, if the stage has a reference switch"),
     34: ("the command is not allowed for this stage", CHECK_MODEL),
     35: ("there is no digital input", CHECK_MODEL),
     36: ("there is no such digital output", "Check trigger_line in the configuration"),

@@ -136,7 +136,7 @@ def fit_series(
     go_on: Callable[[int, float], bool] = lambda sweep, residual: True,
     stop: Callable[[], bool] = lambda: False,
 ) -> TimedVolumes:
-    """Volumes at evenly spaced times, from one least-squares fit to all projections with total variation:
+    """Volumes x_k at evenly spaced times: a least-squares fit to all projections, regularised by total variation:
 
         min ½ Σ_v |A_v W(t_v) Σ_k h_k(t_v) x_k - p_v|² + Σ_j μ_j TV(z_j),    x_k >= 0.
 

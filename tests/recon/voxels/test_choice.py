@@ -110,18 +110,32 @@ def test_a_small_but_certain_gain_suffices_for_a_candidate_that_costs_little(
     gain: float, scatter: float, costs_little: bool, least_gain: float, taken: str
 ) -> None:
     by_view = scatter * np.array([-1.0, 1.0, -1.0, 1.0, 0.0])  # standard error of the mean: scatter / √5
-    choice = TrialChoice("16 rows", least_gain).after(Prediction("tv", (1 + SCATTER).tolist()))
+    choice = TrialChoice("16 rows", least_gain).after(Prediction("tv", (1 + SCATTER).tolist(), Prior(1.0)))
     choice = choice.after(Prediction("pnp", (1 - gain + by_view + SCATTER).tolist(), costs_little=costs_little))
     assert choice.chosen is not None and choice.predictions[choice.chosen].name == taken
     certain = "or by 0.5% and by more than 4 standard errors"
     assert (certain in choice.reason) is (taken == "tv" and costs_little and least_gain == 0.02)
 
 
-def test_a_costly_candidate_with_a_lower_residual_does_not_hide_a_certain_gain() -> None:
-    choice = TrialChoice("16 rows").after(Prediction("tv", (1 + SCATTER).tolist()))
-    choice = choice.after(Prediction("pnp", (0.99 + SCATTER).tolist(), costs_little=True))
-    assert choice.after(Prediction("r2", (0.985 + SCATTER).tolist())).chosen == 1  # r2: 0.5 % below pnp
-    assert choice.after(Prediction("r2", (0.9 + SCATTER).tolist())).chosen == 2
+def test_a_certain_gain_is_one_over_a_candidate_with_a_prior_in_enough_projections() -> None:
+    def chosen(views: int, **means: float) -> str:
+        choice, scatter = TrialChoice("16 rows"), SCATTER[:views]
+        for name, mean in means.items():
+            prior = None if name == "fbp" else Prior(1.0)
+            choice = choice.after(Prediction(name, (mean + scatter).tolist(), prior, costs_little=name == "pnp"))
+        assert choice.chosen is not None
+        if choice.predictions[choice.chosen].name == "pnp" and means.get("tv"):
+            certain = "pnp is 1.00% smaller than the residual of tv (standard error 0.00%). A gain below 2% suffices"
+            assert (certain in choice.reason) is (means["pnp"] == 0.99)
+        return choice.predictions[choice.chosen].name
+
+    assert chosen(5, tv=1, pnp=0.99) == "pnp"
+    assert chosen(4, tv=1, pnp=0.99) == "tv"
+    assert chosen(1, tv=1, pnp=0.99) == "tv"
+    assert chosen(5, fbp=1, pnp=0.99) == chosen(5, fbp=1, tv=0.991, pnp=0.99) == "fbp"
+    assert chosen(5, tv=1, pnp=0.99, r2=0.985) == "pnp"
+    assert chosen(5, tv=1, pnp=0.99, r2=0.9) == "r2"
+    assert chosen(5, tv=1, pnp=0.97) == "pnp"
 
 
 def test_a_choice_names_the_best_and_what_chance_does_not_tell_from_it() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 import recon
 from recon.base.choices import Quality
-from recon.base.decisions import Decisions, GoesOn, Prior
+from recon.base.decisions import Decisions, GoesOn, Prior, always
 from recon.base.geometry import Geometry
 from recon.base.method import Progress, ReconProblem, RunControl
 from recon.base.view_data import Views
@@ -20,16 +21,16 @@ from recon.kernels.cpu.tv import total_variation
 from recon.voxels.choice import TrialChoice
 from recon.voxels.half_voxels import (
     COST,
-    HALVES,
     LARGEST_LOSS,
     WEIGHTS,
     HalfVoxels,
     best_half_voxel_weight,
     halved,
+    predict_as_well_as,
     uses_half_voxels,
     with_halves,
 )
-from recon.voxels.iterative import scaled_problem
+from recon.voxels.iterative import HALVES, scaled_problem
 from recon.voxels.projector import Projector
 from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import difference_weights
@@ -164,9 +165,9 @@ def test_the_record_says_how_many_iterations_used_them() -> None:
     assert result.volume.data.shape == (ROWS, SIDE, SIDE)
 
 
-def trial_of(views: np.ndarray, geometry: Geometry) -> Trial:
-    projector = Projector(geometry, Grid.matching(geometry))
-    scan, _ = scaled_problem(projector, Views(views, geometry), None, True, GoesOn(), Decisions())
+def trial_of(views: np.ndarray, geometry: Geometry, trials: Callable[[int, float], bool] = always) -> Trial:
+    projector, go_on = Projector(geometry, Grid.matching(geometry)), GoesOn(trials=GoesOn(trials))
+    scan, _ = scaled_problem(projector, Views(views, geometry), None, True, go_on, Decisions())
     trial = Trial.of(scan)
     assert trial is not None
     return trial
@@ -237,6 +238,31 @@ def test_a_stop_leaves_them_out() -> None:
     result = recon.FistaTv(tv_weight=0.01, half_voxels=True).run(problem, control)
     assert "half_voxel_iterations" not in result.settings
     assert result.settings["ended"] == "stopped"
+
+
+def test_a_stop_within_their_test_does_not_reject_them() -> None:
+    geometry, stopped = geometry_of(20), [False]
+    volume = np.repeat(truth()[None], ROWS, 0).astype(np.float32)
+    exact_data = recon.Projector(geometry, Grid.matching(geometry)).forward(volume)
+    trial = trial_of(exact_data, geometry, lambda step, _: not (stopped[0] and step > 2))
+    whole = trial.lines_of(Volume(volume, Grid.matching(geometry)))
+    assert best_half_voxel_weight(trial, whole, 1e-2, WEIGHTS, LARGEST_LOSS) == 0
+    stopped[0] = True
+    assert best_half_voxel_weight(trial, whole, 1e-2, WEIGHTS, LARGEST_LOSS) == 1 and trial.ended
+
+
+def test_a_test_that_diverged_rejects_them() -> None:
+    whole = np.ones(3)
+    assert not predict_as_well_as(np.array([1.0, np.nan, 1.0]), whole, 0.01)
+    assert predict_as_well_as(1.005 * whole, whole, 0.01) and not predict_as_well_as(1.015 * whole, whole, 0.01)
+
+
+def test_the_record_states_a_smaller_weight() -> None:
+    geometry = geometry_of(20)
+    for share, recorded in ((0.5, 0.5), (1, None), (0, None)):
+        control = RunControl(decide=Decisions(0, {HALVES: [share]}))
+        result = recon.reconstruct(exact_views(geometry), geometry, recon.FistaTv(tv_weight=1e-3), control=control)
+        assert result.settings.get("half_voxel_weight") == recorded
 
 
 def test_a_slab_that_follows_decisions_is_the_same_to_the_bit() -> None:
