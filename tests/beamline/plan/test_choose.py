@@ -100,7 +100,7 @@ NEXT, ENOUGH = option(Choice.NEXT, 1.0, off=0.2), PassOption(Choice.ENOUGH, 0, 0
             NOTHING,
             9,
             Choice.NEXT,
-            "no other choice is significantly better",
+            "no other choice gains significantly more",
         ),
         ([NEXT, option(Choice.AGAIN, 1.2)], QUALITY, NOTHING, 9, Choice.NEXT, "no other choice"),
         ([NEXT, option(Choice.AGAIN, 1.3)], QUALITY, NOTHING, 9, Choice.AGAIN, "1.30 dB"),
