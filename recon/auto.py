@@ -128,7 +128,7 @@ class Auto(Method):
             return choice
         units, weighed = trial.problem.units, trial.problem.weight is not None
         with threads_for(problem.grid):
-            weight = chosen.best_half_voxel_weight(trial, units.prior(prior, weighed))
+            weight = chosen.half_voxel_weight_of(trial, units.prior(prior, weighed))
         return choice.with_prior(prior._replace(half_voxel_weight=weight))
 
     @property

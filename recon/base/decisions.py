@@ -43,8 +43,8 @@ class Prior(NamedTuple):
         strength: last threshold of the patch-based denoiser (PnP-DCT); 0: PnP-DCT was not tried.
         patches: PnP-DCT predicts held-out projections better than total variation alone.
         materials: discrete levels that voxels are pulled to; None: levels were not searched for.
-        half_voxel_weight: weight of total variation on half voxels, divided by that on whole voxels; 0: half voxels
-            predict held-out projections worse, and are not used; None: not tested.
+        half_voxel_weight: weight of total variation on half voxels, divided by the weight on whole voxels. 0: no half
+            voxels are used, because they predict held-out projections worse. None: half voxels were not tested.
     """
 
     weight: float

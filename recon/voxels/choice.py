@@ -23,7 +23,7 @@ LEAST_GAIN = 0.02
 (On a scan of a tooth, a fit lowers the residual by 1.3 % and takes four times as long.)
 """
 
-_SURE_SHARE, _SURE_ERRORS, _SURE_VIEWS = 0.25, 4.0, 5
+_CERTAIN_SHARE, _CERTAIN_ERRORS, _CERTAIN_VIEWS = 0.25, 4.0, 5
 """A candidate that costs little more than the chosen one replaces it for a small but certain gain: for this share of
 `LEAST_GAIN`, if the gain exceeds this number of standard errors, with at least this number of held-out projections.
 
@@ -176,25 +176,35 @@ class TrialChoice(NamedTuple):
             return None
         if levels is None or self.levels_suffice:
             return self._simplest_of(residuals)
-        other = self._simplest_of({number: each for number, each in residuals.items() if number != levels})
+        other = self._simplest_of(self._without_levels)
         return levels if residuals[levels].mean() < residuals[other].mean() else other
+
+    @property
+    def _without_levels(self) -> dict[int, F64]:
+        """`residuals_by_number` of the candidates without discrete levels."""
+        return {number: each for number, each in self.residuals_by_number.items() if number != self.with_levels}
 
     def _simplest_of(self, residuals: dict[int, F64]) -> int:
         """Number of the first of these candidates that the best does not clearly beat, or of the one that replaces it
         for a small but certain gain."""
         simplest = self._first_unbeaten(residuals)
-        if self.predictions[simplest].prior is None:  # such as FBP, which takes much less time
-            return simplest
         return next(
             (
                 number
                 for number, each in residuals.items()
-                if self.predictions[number].costs_little
-                and each.size >= _SURE_VIEWS
-                and significantly_better(each, residuals[simplest], _SURE_SHARE * self.least_gain, _SURE_ERRORS)
+                if self._may_be_certain(number, simplest)
+                and significantly_better(each, residuals[simplest], _CERTAIN_SHARE * self.least_gain, _CERTAIN_ERRORS)
             ),
             simplest,
         )
+
+    def _may_be_certain(self, better: int, simpler: int) -> bool:
+        """Whether a small but certain gain suffices for one candidate to replace another.
+
+        The other one has a prior. (FBP, which has none, takes much less time.)
+        """
+        enough_views = self.residuals_by_number[better].size >= _CERTAIN_VIEWS
+        return enough_views and self.predictions[better].costs_little and self.predictions[simpler].prior is not None
 
     def _first_unbeaten(self, residuals: dict[int, F64]) -> int:
         """Number of the first of these candidates that the best of them does not beat by `least_gain`."""
@@ -247,12 +257,14 @@ class TrialChoice(NamedTuple):
     @property
     def _certain(self) -> str:
         """That the chosen candidate replaced a simpler one for a small but certain gain; empty if it did not."""
-        simplest = self._first_unbeaten(self.residuals_by_number)
-        if self.chosen is None or not self.predictions[self.chosen].costs_little or simplest >= self.chosen:
+        if self.chosen is None or not self.predictions[self.chosen].costs_little:
+            return ""
+        simplest = self._first_unbeaten(self._without_levels)
+        if simplest >= self.chosen:
             return ""
         return (
             f". {self._gain(self.chosen, simplest)}. A gain below {self.least_gain:.0%} suffices here, because it "
-            f"exceeds {_SURE_ERRORS:.0f} standard errors and {self.predictions[self.chosen].name} costs little"
+            f"exceeds {_CERTAIN_ERRORS:.0f} standard errors and {self.predictions[self.chosen].name} costs little"
         )
 
     def _gain(self, better: int, worse: int) -> str:
@@ -273,8 +285,8 @@ class TrialChoice(NamedTuple):
             return ""
         margin = f"{self.least_gain:.0%} and by more than " if self.least_gain else "more than "
         certain = (
-            f", or by {_SURE_SHARE * self.least_gain:.1%} and by more than {_SURE_ERRORS:.0f} standard errors"
-            if self.least_gain and self.predictions[self.best].costs_little and self.prior is not None
+            f", or by {_CERTAIN_SHARE * self.least_gain:.1%} and by more than {_CERTAIN_ERRORS:.0f} standard errors"
+            if self.least_gain and self._may_be_certain(self.best, self.chosen)
             else ""
         )
         return (

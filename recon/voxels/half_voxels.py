@@ -28,7 +28,7 @@ from recon.base.decisions import Prior
 from recon.base.empirical import ONE_IN, STILL_IN_TRIAL
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.voxels.iterative import HALVES, VoxelMethod
+from recon.voxels.iterative import VoxelMethod
 from recon.voxels.ordered_fista import Prox, Pull, Subsets, ordered_fista, subsets_of
 from recon.voxels.priors import TvWeight, tv_prox
 from recon.voxels.resolution import smoothed
@@ -65,6 +65,8 @@ and 0.4 dB if levels are not rejected; `auto` takes other methods for most of th
 _MOST_COLUMNS, _WIDEST, _LEAST_WIDTH, _AS_WIDE = 1024, 2.2, 0.75, 0.1
 # copies of half-voxel volumes: a quarter for the volume of whole voxels, the rest for the coarse cells of damping
 _MORE_VOLUMES = 0.6
+HALVES = "half_voxels"
+"""Name of the decision whether half voxels are used, and with which weight: see `Prior.half_voxel_weight`."""
 _TEST_ROWS, _MARGIN_ROWS = 8, 2
 """Number of rows of the test reconstruction with half voxels, and number of rows at each end that do not count.
 
@@ -77,7 +79,7 @@ variation alone, and with discrete levels.
 The measurements are in docs/decisions/voxels.md. The test reconstruction must converge. After 6 iterations, its
 residual does not show whether half voxels improve the volume.
 """
-WEIGHTS, _LEAST_FALL = (1.0, 0.7, 0.5, 0.35), 0.005
+HALF_VOXEL_WEIGHTS, _LEAST_FALL = (1.0, 0.7, 0.5, 0.35), 0.005
 """Weights of total variation that are tested on half voxels, divided by the weight on whole voxels, and the share by
 which each must lower the residual of the weight before it.
 
@@ -136,11 +138,11 @@ class HalfVoxels(VoxelMethod):
 
     @property
     def half_voxel_weights(self) -> tuple[float, ...]:
-        """The weights of total variation that are tested on half voxels, see `WEIGHTS`."""
-        return WEIGHTS
+        """The weights of total variation that are tested on half voxels, see `HALF_VOXEL_WEIGHTS`."""
+        return HALF_VOXEL_WEIGHTS
 
-    def best_half_voxel_weight(self, trial: Trial, prior: Prior) -> float:
-        """`best_half_voxel_weight` for the volume that the method makes in a trial.
+    def half_voxel_weight_of(self, trial: Trial, prior: Prior) -> float:
+        """The weight that `best_half_voxel_weight` finds for the volume that the method makes in a trial.
 
         Args:
             prior: the prior of the volume, in the units of the trial.
@@ -160,19 +162,21 @@ class HalfVoxels(VoxelMethod):
             if problem.prior is not None:
                 return 1.0 if problem.prior.half_voxel_weight is None else problem.prior.half_voxel_weight
             judge = trial()
-            return 1.0 if judge is None else self.best_half_voxel_weight(judge, prior)
+            return 1.0 if judge is None else self.half_voxel_weight_of(judge, prior)
 
         projector = problem.projector
         return problem.decide(HALVES, decided) if self.halves(projector.geometry, projector.grid) else 0.0
 
     def in_half_voxels(
-        self, problem: VoxelProblem, x: F32, mu: float, tv_steps: int, pull: MakePull | None = None, first: int = 0
-    ) -> F32:
-        """The volume x [y, x, z] after further iterations on half voxels.
+        self, problem: VoxelProblem, x: F32, mu: float, weight: float, tv_steps: int, pull: MakePull | None = None,
+        first: int = 0,
+    ) -> F32:  # fmt: skip
+        """The volume x [y, x, z] after further iterations on half voxels. The record states a weight below 1.
 
         Args:
             x: the volume of whole voxels.
-            mu: as in `on_half_voxels`.
+            mu: weight μ of total variation with whole voxels.
+            weight: the weight on half voxels, divided by μ.
             tv_steps: dual steps of each proximal step with whole voxels.
             pull: as in `on_half_voxels`.
             first: number of planned iterations before those that made x, for the progress.
@@ -180,9 +184,11 @@ class HalfVoxels(VoxelMethod):
         decide = problem.decide
         sweeps_before = 0 if decide.ended is None else decide.ended.after
         x = on_half_voxels(
-            problem, x, mu, lambda fine: tv_prox(fine, DUAL_STEPS * tv_steps), done=first + sweeps_before,
+            problem, x, weight * mu, lambda fine: tv_prox(fine, DUAL_STEPS * tv_steps), done=first + sweeps_before,
             sweeps=self.iterations, still=self.still, pull=pull,
         )  # fmt: skip
+        if weight < 1:
+            decide.settings["half_voxel_weight"] = weight
         if (ended := decide.ended) is not None:
             decide.ended = ended._replace(after=sweeps_before + ended.after, on_half_voxels=ended.after)
         return x
@@ -276,7 +282,7 @@ def on_half_voxels(
     times as many voxels, are twice as large. Therefore the weight is halved.
 
     Args:
-        mu: weight μ of total variation with whole voxels, times the weight of half voxels (see `WEIGHTS`).
+        mu: weight μ of total variation with whole voxels, times the weight of half voxels (see `HALF_VOXEL_WEIGHTS`).
         prox_of: function of the problem with half voxels; returns the proximal step.
         done: number of iterations on whole voxels, for the progress.
         sweeps, still: as in `ordered_fista`.

@@ -34,8 +34,6 @@ from recon.voxels.resolution import smoothed
 from recon.voxels.voxel_problem import Buffers, Units, VoxelProblem, bytes_of, times_power
 
 UNITS = "units"  # name of the decision about the units
-HALVES = "half_voxels"
-"""Name of the decision whether half voxels are used, and with which weight: see `Prior.half_voxel_weight`."""
 TV_WEIGHT_CHOSEN = "tv_weight_chosen"
 """Name of the weight of total variation that a method chose, as a value of its setting `tv_weight`."""
 _VOXELS_PER_THREAD = 2**16  # fewest voxels per thread in a single slice; with fewer, threads mostly wait for each other
@@ -224,8 +222,6 @@ class VoxelMethod(Iterative):
             self, projector, problem.views.masked(), nonnegative=not self.allow_negative, go_on=go_on, decide=decide,
         )  # fmt: skip
         chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}
-        if 0 < (on_halves := decide.made.get(HALVES, [1])[-1]) < 1:
-            chosen["half_voxel_weight"] = on_halves
         return Reconstruction(volume, {**settings, **chosen, **decide.record, "seed": problem.seed}, tuple(history))
 
 

@@ -18,7 +18,7 @@ from recon.base.setting import Count, Natural, NonNegative
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.choice import TRIALS, Prediction, TrialChoice
-from recon.voxels.half_voxels import WEIGHTS, HalfVoxels, with_halves
+from recon.voxels.half_voxels import HALF_VOXEL_WEIGHTS, HalfVoxels, with_halves
 from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_SWEEPS
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
 from recon.voxels.ordered_fista import MANY_SUBSETS, SUBSETS, Subsets, ordered_fista, subsets_of
@@ -110,12 +110,12 @@ class FistaTv(HalfVoxels):
         if not on_halves:
             return x
         trial.cache_clear()
-        return self.in_half_voxels(problem, x, on_halves * weight.value, self.tv_steps)
+        return self.in_half_voxels(problem, x, weight.value, on_halves, self.tv_steps)
 
     @property
     def half_voxel_weights(self) -> tuple[float, ...]:
         """A weight that the caller gives is the weight on half voxels, too."""
-        return WEIGHTS if self.tv_weight is None else WEIGHTS[:1]
+        return HALF_VOXEL_WEIGHTS if self.tv_weight is None else HALF_VOXEL_WEIGHTS[:1]
 
     def with_weight(
         self, problem: VoxelProblem, x: F32, trial: Callable[[], Trial | None] | None = None

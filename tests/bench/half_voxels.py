@@ -26,8 +26,7 @@ import recon
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.voxels.half_voxels import halved
-from recon.voxels.iterative import HALVES
+from recon.voxels.half_voxels import HALVES, halved
 from recon.voxels.projector import Projector
 from tests.bench.first_users import Cell, judged, noisy
 from tests.bench.first_users_scenes import scene_of

@@ -153,7 +153,7 @@ def _grid_in_mm(path: Path, record: Any, voxel_um: Spacing | None, warn: Callabl
 
 
 def _most_slices(path: Path, grid: Grid, wanted: int, memory: int, crop: Crop, whole: bool) -> int:
-    """Number of slices of which the measurement fits the memory. Arguments as for `read_volume`.
+    """The largest number of slices that can be measured within the memory. The arguments are those of `read_volume`.
 
     Raises:
         DataError: fewer than 8 slices fit (with `whole`: fewer than `wanted`).

@@ -22,7 +22,7 @@ from recon.features.discrete.mixture import (
     thin_parts,
 )
 from recon.voxels.choice import LEAST_GAIN, significantly_better
-from recon.voxels.half_voxels import LARGEST_LOSS_WITH_LEVELS, WEIGHTS, best_half_voxel_weight
+from recon.voxels.half_voxels import HALF_VOXEL_WEIGHTS, LARGEST_LOSS_WITH_LEVELS, best_half_voxel_weight
 from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem
 
@@ -149,11 +149,12 @@ class MaterialTrial:
             return best, fewer
         return None
 
-    def best_half_voxel_weight(self, materials: MaterialPrior) -> float:
-        """`best_half_voxel_weight` for a volume with these levels."""
+    def half_voxel_weight(self, materials: MaterialPrior) -> float:
+        """The weight that `best_half_voxel_weight` finds for a volume with these levels."""
         whole, weight = self._as_made(materials), self._weight * materials.tv_share
-        pull = partial(pull_to, materials)
-        return best_half_voxel_weight(self._trial, whole, weight, WEIGHTS, LARGEST_LOSS_WITH_LEVELS, pull)
+        return best_half_voxel_weight(
+            self._trial, whole, weight, HALF_VOXEL_WEIGHTS, LARGEST_LOSS_WITH_LEVELS, partial(pull_to, materials)
+        )
 
     def _is_better(self, materials: MaterialPrior) -> bool:
         """Whether a volume as it will be made with these levels predicts better than total variation."""

@@ -170,7 +170,7 @@ class Discrete(HalfVoxels):
             return x
         if materials is None:
             on_halves = without_levels.half_voxel_weight(problem, Prior(mu), trial)
-            return without_levels.in_half_voxels(problem, x, on_halves * mu, TV_STEPS) if on_halves else x
+            return without_levels.in_half_voxels(problem, x, mu, on_halves, TV_STEPS) if on_halves else x
         sweeps_before = 0 if problem.decide.ended is None else problem.decide.ended.after
         x = self.pulled(problem, x, weight, materials, self.first_sweeps)
         if (ended := problem.decide.ended) is not None:
@@ -182,15 +182,15 @@ class Discrete(HalfVoxels):
             return x
         pull = partial(pull_to, materials)
         return self.in_half_voxels(
-            problem, x, on_halves * mu * materials.tv_share, TV_STEPS, pull, self.first_sweeps - sweeps_before
+            problem, x, mu * materials.tv_share, on_halves, TV_STEPS, pull, self.first_sweeps - sweeps_before
         )
 
-    def best_half_voxel_weight(self, trial: Trial, prior: Prior) -> float:
-        """As for other methods, with these levels if there are any."""
+    def half_voxel_weight_of(self, trial: Trial, prior: Prior) -> float:
+        """As for other methods, with the levels of the prior if it has any."""
         materials = prior.materials
         if materials is None or not materials.levels:
-            return super().best_half_voxel_weight(trial, prior)
-        return MaterialTrial(trial, prior.weight, self.iterations, materials.levels).best_half_voxel_weight(materials)
+            return super().half_voxel_weight_of(trial, prior)
+        return MaterialTrial(trial, prior.weight, self.iterations, materials.levels).half_voxel_weight(materials)
 
     def materials(
         self, problem: VoxelProblem, weight: TvWeight, trial: Callable[[], Trial | None]

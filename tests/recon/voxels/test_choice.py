@@ -149,6 +149,19 @@ def test_a_choice_names_the_best_and_what_chance_does_not_tell_from_it() -> None
     assert verdicts(ended) == [""]
 
 
+def test_the_reason_of_a_certain_gain_names_the_candidate_that_was_replaced_not_the_levels() -> None:
+    """As of the fine structure of bone: patches predict hardly better than levels."""
+    levels = Prior(1.0, materials=MaterialPrior((0.0, 1.0), (0.5, 0.5), 1.0, 0.02, 0.1))
+    choice = TrialChoice("16 rows").after(Prediction("tv", (1 + SCATTER).tolist(), Prior(1.0)))
+    choice = choice.after(Prediction("discrete", (0.985 + SCATTER).tolist(), levels))
+    choice = choice.after(Prediction("pnp", (0.984 + SCATTER).tolist(), Prior(1.0), costs_little=True))
+    assert choice.chosen == 2 and "1.60% smaller than the residual of tv" in choice.reason
+    few = choice._replace(
+        predictions=tuple(each._replace(residuals=(each.residuals or ())[:4]) for each in choice.predictions)
+    )
+    assert few.chosen == 1 and "4 standard errors" not in few.reason
+
+
 def test_a_choice_says_why_the_lowest_residual_is_not_taken() -> None:
     def reason(gain: float, least_gain: float, scatter: NDArray[np.float64] = 0 * SCATTER) -> str:
         given = (Prediction(name, left.tolist()) for name, left in (("tv", 1 + scatter), ("r2", 1 - gain - scatter)))

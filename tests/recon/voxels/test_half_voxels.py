@@ -21,8 +21,9 @@ from recon.kernels.cpu.tv import total_variation
 from recon.voxels.choice import TrialChoice
 from recon.voxels.half_voxels import (
     COST,
+    HALF_VOXEL_WEIGHTS,
+    HALVES,
     LARGEST_LOSS,
-    WEIGHTS,
     HalfVoxels,
     best_half_voxel_weight,
     halved,
@@ -30,7 +31,7 @@ from recon.voxels.half_voxels import (
     uses_half_voxels,
     with_halves,
 )
-from recon.voxels.iterative import HALVES, scaled_problem
+from recon.voxels.iterative import scaled_problem
 from recon.voxels.projector import Projector
 from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import difference_weights
@@ -179,12 +180,12 @@ def test_they_are_rejected_if_whole_voxels_predict_better() -> None:
     volume = np.repeat(truth()[None], ROWS, 0).astype(np.float32)
     exact = trial_of(recon.Projector(geometry, Grid.matching(geometry)).forward(volume), geometry)
     whole = exact.lines_of(Volume(volume, Grid.matching(geometry)))
-    assert best_half_voxel_weight(exact, whole, 1e-3, WEIGHTS[:1], LARGEST_LOSS) == 0
-    assert best_half_voxel_weight(exact, whole, 1e-2, WEIGHTS, LARGEST_LOSS) == 0
+    assert best_half_voxel_weight(exact, whole, 1e-3, HALF_VOXEL_WEIGHTS[:1], LARGEST_LOSS) == 0
+    assert best_half_voxel_weight(exact, whole, 1e-2, HALF_VOXEL_WEIGHTS, LARGEST_LOSS) == 0
     noisy = np.random.default_rng(1).normal(exact_views(geometry), 0.01).astype(np.float32)
     trial = trial_of(noisy, geometry)
     assert trial.weight is not None
-    assert recon.FistaTv().best_half_voxel_weight(trial, Prior(trial.weight)) == 1
+    assert recon.FistaTv().half_voxel_weight_of(trial, Prior(trial.weight)) == 1
 
 
 def test_a_smaller_weight_is_tested_before_they_are_rejected() -> None:
@@ -193,7 +194,7 @@ def test_a_smaller_weight_is_tested_before_they_are_rejected() -> None:
     volume = np.repeat(truth()[None], ROWS, 0).astype(np.float32)
     exact = trial_of(recon.Projector(geometry, Grid.matching(geometry)).forward(volume), geometry)
     whole = exact.lines_of(Volume(volume, Grid.matching(geometry)))
-    assert 0 < best_half_voxel_weight(exact, whole, 1e-3, WEIGHTS, LARGEST_LOSS) < 1
+    assert 0 < best_half_voxel_weight(exact, whole, 1e-3, HALF_VOXEL_WEIGHTS, LARGEST_LOSS) < 1
     assert recon.FistaTv(tv_weight=1e-3).half_voxel_weights == (1,)  # the weight of the caller is kept
 
 
@@ -246,9 +247,9 @@ def test_a_stop_within_their_test_does_not_reject_them() -> None:
     exact_data = recon.Projector(geometry, Grid.matching(geometry)).forward(volume)
     trial = trial_of(exact_data, geometry, lambda step, _: not (stopped[0] and step > 2))
     whole = trial.lines_of(Volume(volume, Grid.matching(geometry)))
-    assert best_half_voxel_weight(trial, whole, 1e-2, WEIGHTS, LARGEST_LOSS) == 0
+    assert best_half_voxel_weight(trial, whole, 1e-2, HALF_VOXEL_WEIGHTS, LARGEST_LOSS) == 0
     stopped[0] = True
-    assert best_half_voxel_weight(trial, whole, 1e-2, WEIGHTS, LARGEST_LOSS) == 1 and trial.ended
+    assert best_half_voxel_weight(trial, whole, 1e-2, HALF_VOXEL_WEIGHTS, LARGEST_LOSS) == 1 and trial.ended
 
 
 def test_a_test_that_diverged_rejects_them() -> None:

@@ -14,7 +14,7 @@ import recon
 from recon.base.decisions import Decisions
 from recon.base.method import RunControl
 from recon.features.discrete.methods import UNDECIDED
-from recon.voxels.iterative import HALVES
+from recon.voxels.half_voxels import HALVES
 from recon.voxels.methods import PnpDct
 from recon.voxels.projector import Projector
 
