@@ -242,8 +242,8 @@ class Geometry:
     def unseen_cone(self) -> float:
         """Half angle in radians of the cone about the rotation axis, in Fourier space, that no projection measures.
 
-        It equals the smallest tilt of the axis along the beam among all projections. It counts as 0 if this tilt moves
-        the edge of the field of view by at most half a pixel.
+        The half angle equals the smallest tilt of the axis along the beam among all projections. The half angle counts
+        as 0 if this tilt moves the edge of the field of view by at most half a pixel.
         """
         least = float(np.abs(self.tilt).min())
         return least if self.reach * math.sin(least) > 0.5 * self.sample_pitch else 0.0
