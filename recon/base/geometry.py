@@ -325,7 +325,7 @@ class Geometry:
 
     def origin(self, view: int) -> tuple[float, float]:
         """Pixel (col, row) at which one projection shows the origin of the object's frame; if the geometry has
-        `centres`, the pixel at which it shows its own centre."""
+        `centres`, the pixel at which the projection shows its own centre."""
         return self.axis_col + float(self.shifts[view, 0]), self.axis_row + float(self.shifts[view, 1])
 
     def __repr__(self) -> str:

@@ -45,9 +45,9 @@ class FistaTv(HalfVoxels):
     30 projections. Memory: 8 volumes and 2 times the projections.
 
     The number of dual steps was chosen on a cathode of 512 columns, on whole voxels (tests/bench/ends.py). From 45
-    projections, the volume of this cathode does not converge in 60 iterations with 3 dual steps (22.8 dB), but in 45
-    iterations with 12 dual steps (23.3 dB). From 180 projections, the volume of the cathode converges in 27 iterations
-    with 3 dual steps and in 19 iterations with 12 dual steps.
+    projections, the volume of this cathode has not converged after 60 iterations with 3 dual steps (22.8 dB), but
+    converges in 45 iterations with 12 dual steps (23.3 dB). From 180 projections, the volume of the cathode converges
+    in 27 iterations with 3 dual steps and in 19 iterations with 12 dual steps.
 
     Attributes:
         iterations: largest number of iterations over all projections.
@@ -173,7 +173,7 @@ class OsSirtTv(VoxelMethod):
         tv_weight: threshold of the proximal step in density units; None: chosen by held-out projections or from the
             noise, see `choose_weight`.
         still: as in `FistaTv`.
-        momentum: False: without momentum; the volume then needs about three times as many iterations.
+        momentum: False: without momentum; the volume then needs about three times as many iterations as with momentum.
     """
 
     name: ClassVar[str] = "os-sirt-tv"

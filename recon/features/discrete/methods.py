@@ -136,8 +136,8 @@ class Discrete(HalfVoxels):
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """How well the method predicts held-out projections: with the best discrete levels, or with total variation
-        alone if no levels are better. If a simpler candidate already has the volume of total variation alone, the
-        method counts as not tried.
+        alone if no levels are better. If no levels are better, and a simpler candidate has already predicted with total
+        variation alone, the method counts as not tried.
         """
         if trial.weight is None:
             return Prediction(
