@@ -33,13 +33,13 @@ class Auto(Method):
 
     The tests use the sixteen rows with most material; in a cone beam, the sixteen rows in the middle. If the middle
     rows contain little material, the tests use all rows at half the resolution. The test reconstructions hold out every
-    eighth projection. They need at least 16 projections; with fewer, `Auto` takes the last of its candidates.
-    docs/choosing.md explains this way to choose a method.
+    eighth projection. The tests need at least 16 projections; with fewer projections, `Auto` takes the last of its
+    candidates. docs/choosing.md explains this way to choose a method.
 
     Attributes:
         candidates: the methods, the simplest and cheapest first.
         least_gain: smallest fraction by which a costlier method must lower the residual in the held-out projections, so
-            that `Auto` takes it. For `PnpDct`, a quarter of it suffices if the gain is certain.
+            that `Auto` takes it. For `PnpDct`, a quarter of `least_gain` suffices if the gain is certain.
     """
 
     name: ClassVar[str] = AUTO

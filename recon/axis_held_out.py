@@ -45,11 +45,12 @@ def axis_by_views(
     """The column of the rotation axis with which a volume from two thirds of the projections predicts the other third
     best.
 
-    The stated axis must be within a fifth of the detector's width of the true axis, because only there the residual has
-    a single minimum. The search begins with coarse steps and halves the step around the best candidate. At the end, the
-    residuals of three candidates are computed on finer pixels, and the result is the minimum of the parabola through
-    the three residuals. If the sample is wider than the field of view, the box of voxels is twice as wide as the field
-    of view. For a 180° scan of a sample wider than the field of view in a parallel beam, use `find_axis` instead.
+    The column `axis_col` of `geometry` must be within a fifth of the detector's width of the true axis, because only
+    there the residual has a single minimum. The search begins with coarse steps and halves the step around the best
+    candidate. At the end, the residuals of three candidates are computed on finer pixels, and the result is the minimum
+    of the parabola through the three residuals. If the sample is wider than the field of view, the box of voxels is
+    twice as wide as the field of view. For a 180° scan of a sample wider than the field of view in a parallel beam, use
+    `find_axis` instead.
 
     Args:
         projections: float32 [view, row, col], line integrals; 90 projections (`VIEWS`) of 128 columns (`COLS`) suffice.

@@ -195,7 +195,7 @@ def connect(
 
     Raises:
         ConfigError: the configuration is wrong; the message lists every fault with file, line, key and allowed values.
-        DeviceError: a device does not answer. The devices that were already open are closed again.
+        DeviceError: a device does not answer. `connect` closes the devices that it had already opened.
     """
     refuse_wrong_arguments(connect, locals())
     read = load(config, [override_of(key, value) for key, value in (set or {}).items()])

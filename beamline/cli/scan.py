@@ -146,7 +146,7 @@ def scan(request: ScanRequest) -> None:
     stops the scan cleanly; the second Ctrl-C aborts it. After a stop and after an abort, the scan file is readable.
 
     If you give several CONFIGs, or a TABLE.csv with one line per scan (docs/commands.md), the scans run one after the
-    other. If one scan fails, the next one starts anyway; Ctrl-C ends all of them.
+    other. If one scan fails, the next one starts anyway; Ctrl-C ends all scans.
 
     If CONFIG has `scan.energies` or `scan.states`, the command takes one scan at each energy, or one scan of each state
     of the sample, and puts all these scans in one folder. --resume can also continue a series of energies or states.

@@ -224,8 +224,8 @@ class StopRequest:
             raise ScanAborted(f"Aborted: {self.reason}.")
 
     def stop(self, reason: str = "the operator asked for it", *, by_itself: bool = False) -> None:
-        """Request a clean end: the scan still acquires pending frames, and planned darks or flats of a kind that it
-        does not have yet. The stage returns.
+        """Request a clean end: the scan still acquires pending frames, and the planned darks (or flats) if it has no
+        darks (or flats) yet. The stage returns.
 
         Args:
             by_itself: True if the scan itself requests the stop, because the frames so far show that no more frames are

@@ -192,7 +192,7 @@ def connect(
         check_stop: function that is called repeatedly during waits; an exception from it ends the wait.
 
     Raises:
-        DeviceError: a device does not answer. The devices that were already open are closed again.
+        DeviceError: a device does not answer. `connect` closes the devices that it had already opened.
         ConfigError: the simulated scene is wrong.
     """
     with ExitStack() as opened:

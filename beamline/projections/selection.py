@@ -39,7 +39,7 @@ class Selection:
             pixel size is unknown); None: the value in the file, or estimated from the projections.
         pixel_size_mm: size of a pixel at the sample (for a cone beam: on the detector); None: the value in the file.
         cone: distances from the source to the rotation axis and to the detector, in mm; None: the values in the file,
-            or a parallel beam if it has none.
+            or a parallel beam if the file states no distances.
         central_row: for a cone beam, detector row at which the ray perpendicular to the rotation axis meets the
             detector; it may lie outside the detector; None: the middle row.
         seed: seed of random selections of projections.

@@ -242,8 +242,8 @@ class Geometry:
     def unseen_cone(self) -> float:
         """Half angle in radians of the cone about the rotation axis, in Fourier space, that no projection measures.
 
-        It equals the smallest tilt of the axis along the beam among all projections. It counts as 0 if this tilt moves
-        the edge of the field of view by at most half a pixel.
+        The half angle equals the smallest tilt of the axis along the beam among all projections. The half angle counts
+        as 0 if this tilt moves the edge of the field of view by at most half a pixel.
         """
         least = float(np.abs(self.tilt).min())
         return least if self.reach * math.sin(least) > 0.5 * self.sample_pitch else 0.0
@@ -325,7 +325,7 @@ class Geometry:
 
     def origin(self, view: int) -> tuple[float, float]:
         """Pixel (col, row) at which one projection shows the origin of the object's frame; if the geometry has
-        `centres`, the pixel at which it shows its own centre."""
+        `centres`, the pixel at which the projection shows its own centre."""
         return self.axis_col + float(self.shifts[view, 0]), self.axis_row + float(self.shifts[view, 1])
 
     def __repr__(self) -> str:

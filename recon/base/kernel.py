@@ -18,10 +18,11 @@ class Kernel(StrEnum):
     = 2 m + 5. The radius R gives the kernels `compact:1.5` and `gaussian` the same second moment, so a covariance
     describes the same width for both kernels.
 
-    The line integral of the compact kernel is a kernel of the same form, with the exponent m + 1/2 instead of m. It is
-    a polynomial for m = 3/2: ∫ (1 - t² - s²)₊^m ds = √π Γ(m + 1) / Γ(m + 3/2) (1 - t²)₊^(m + 1/2). The compact kernel
-    ends at a finite radius, while a Gaussian kernel must be cut off. The projection of the compact kernel is steeper at
-    its edge than that of a Gaussian, and has no tail. The compact kernel suits samples with sharp edges.
+    The line integral of the compact kernel is a kernel of the same form, with the exponent m + 1/2 instead of m. For m
+    = 3/2 the line integral is a polynomial: ∫ (1 - t² - s²)₊^m ds = √π Γ(m + 1) / Γ(m + 3/2) (1 - t²)₊^(m + 1/2). The
+    compact kernel ends at a finite radius, while a Gaussian kernel must be cut off. The projection of the compact
+    kernel is steeper at its edge than that of a Gaussian, and has no tail. The compact kernel suits samples with sharp
+    edges.
     """
 
     GAUSSIAN = "gaussian"
@@ -53,7 +54,7 @@ class Kernel(StrEnum):
 
     @property
     def exponent(self) -> float:
-        """Exponent m of a compact kernel; infinite for a Gaussian, which is the limit."""
+        """Exponent m of a compact kernel; infinite for a Gaussian, which is the limit of compact kernels."""
         return 1.5 if self.is_compact else math.inf
 
     @property

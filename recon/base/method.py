@@ -106,8 +106,8 @@ class RunControl(Checked):
             every sixteen slices of FBP.
         on_checkpoint: function that gets the checkpoint of a fit every `checkpoint_every` s.
         resume: checkpoint from which a fit with the same data and settings continues.
-        decide: records the decisions that the method derives from its data; the method repeats the decisions of an
-            earlier run that `decide` contains; None: the method decides by itself.
+        decide: object in which the method records what it decides from its data; if it contains decisions of an earlier
+            run, the method repeats these decisions; None: the method decides by itself.
         stop_trials: function that is called after each iteration of the test reconstructions that choose the weight of
             total variation; True ends only the test reconstructions; None: same as `should_stop`.
     """
@@ -300,8 +300,9 @@ class Reconstruction:
     def load(cls, path: str | Path) -> Self:
         """Read a reconstruction from an .npz file that `save` wrote.
 
-        `load` also reads a file of `Volume.save`, which contains no method and no settings: both are then empty. In the
-        settings, `save` stored arrays and sequences as lists, and values without a JSON type as text.
+        `load` also reads a file of `Volume.save`, which contains no method and no settings; `method` and `settings` of
+        the result are then empty. In the settings, `save` stored arrays and sequences as lists, and values without a
+        JSON type as text.
 
         Raises:
             ValueError, KeyError: the file is not an .npz, or another program wrote it.

@@ -93,8 +93,9 @@ class Counts:
         """Three images [row, col] of a projection: the counted photons, the photons without the sample, and the
         variance v of a dark frame in photons² (see `Counts`).
 
-        Read noise can make the counted photons negative; values below -v are replaced by -v. They are NaN if the counts
-        of the pixel are NaN. If the flat of a pixel is not above the dark, the photons without the sample are 0.
+        Read noise can make the counted photons negative; values below -v are replaced by -v. The counted photons of a
+        pixel are NaN if the counts of the pixel are NaN. If the flat of a pixel is not above the dark, the photons
+        without the sample are 0.
         """
         dark = np.asarray(self.dark, np.float64)
         flat = np.asarray(self.flat)

@@ -51,7 +51,7 @@ class CorrectionSettings:
     `references.edge_depth`.
 
     Attributes:
-        floor: smallest transmission; smaller ones are replaced by it.
+        floor: smallest transmission; a smaller transmission is replaced by `floor`.
         hot_threshold: limit in robust standard deviations; inf: no pixel is masked.
         zinger_threshold: limit in standard deviations; inf: no zinger is removed.
         air: number of columns (left, right) that see no sample in any projection, or "auto" to find them, or "none".

@@ -29,7 +29,7 @@ class References:
 
     If darks or flats are a stack of frames [frame, row, col] of any real type, the stack is replaced by the mean of its
     frames, without the zingers of single frames. The flat of a projection is computed from the flats in the same part
-    of the scan (see `part_starts`). If this part contains no flats, the nearest group of flats is used.
+    of the scan (see `part_starts`). If the part of the scan contains no flats, the nearest group of flats is used.
 
     Attributes:
         dark: float32 [row, col], mean or median of the darks; or all darks as a stack.

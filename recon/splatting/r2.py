@@ -96,10 +96,10 @@ class R2(Fit):
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The residuals of the method's volume in the held-out projections.
 
-        The test makes a quarter of the steps of the fit. It makes all steps only if a quarter does not decide whether
-        the fit predicts best, see `trial_fit.predict`. The test runs the whole method unchanged, with its stopping
-        rule and its voxel refinement, in these cases: `finish`, `seconds` or `early_stop` is set; the fit starts from
-        given Gaussians; the trial could not choose a regularisation weight.
+        The test makes a quarter of the steps of the fit. The test makes all steps only if a quarter of the steps does
+        not decide whether the fit predicts best, see `trial_fit.predict`. The test runs the whole method unchanged,
+        with its stopping rule and its voxel refinement, in these cases: `finish`, `seconds` or `early_stop` is set; the
+        fit starts from given Gaussians; the trial could not choose a regularisation weight.
         """
         by_other_settings = self.finish is not None or self.seconds is not None or isinstance(self.gaussians, Gaussians)
         if by_other_settings or self.early_stop or trial.prior is None:

@@ -187,16 +187,17 @@ TV_LEAST_SIDE = 32  # smallest side, in voxels, of the box of total variation (Z
 class FitSettings:
     """Settings of a Gaussian fit. Defaults are the published values (Zha et al. 2024) unless stated otherwise.
 
-    The default weight of total variation is at most 0.25. It is lower for samples with strong edges: if the density
-    changes from voxel to voxel by more than 0.16 density units, the weight falls with the square of this change. In
-    the published code (weight 0.05), the gradient of total variation with respect to the centres is too small by the
-    square of the voxel size, so total variation does not move the centres. The correct gradient raises the PSNR of the
-    walnut by 0.2 dB (60 projections) and that of the battery by 0.4 dB (90 projections).
+    The default weight of total variation is at most 0.25. The default weight is lower for samples with strong edges: if
+    the density changes from voxel to voxel by more than 0.16 density units, the weight falls with the square of this
+    change. In the published code (weight 0.05), the gradient of total variation with respect to the centres is too
+    small by the square of the voxel size, so total variation does not move the centres. The correct gradient raises the
+    PSNR of the walnut by 0.2 dB (60 projections) and that of the battery by 0.4 dB (90 projections).
 
-    The published learning rates are for 30 000 steps, and a fit of 1000 steps with them is far from convergence. With
-    `pace` 20 (all rates are 20 times the published ones), two projections per step and a low last rate, a fit of 1000
-    steps gains 1 to 4 dB. With rates 26 times the published ones and a higher last rate, 400 steps before the voxel
-    refinement suffice for a volume that needs 500 steps with `pace` 20.
+    The published learning rates are for 30 000 steps, and a fit of 1000 steps with the published rates is far from
+    convergence. With `pace` 20 (all rates are 20 times the published ones), two projections per step and a low last
+    rate, a fit of 1000 steps gains 1 to 4 dB over a fit with the published rates. With rates 26 times the published
+    ones and a higher last rate, 400 steps before the voxel refinement suffice for a volume that needs 500 steps with
+    `pace` 20.
 
     Attributes:
         loss: "l1" (published), "l2", or "poisson" (squares weighted by the transmission).

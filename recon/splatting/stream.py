@@ -133,12 +133,12 @@ class StreamingFit:
         """Replace the line integrals [view, row, col] of all projections so far, in order, after a changed correction.
 
         The fit keeps its model, unless the new data differ by more than a fifth (norm) from the data with which the
-        Gaussians were placed. In that case the Gaussians are placed again.
+        Gaussians were placed. If the data differ by more, the Gaussians are placed again.
 
         Args:
-            kept: numbers, in order, of the projections that the fit keeps; `data` then contains only these. The fit
-                drops the others. The learning rates then start again from their first values, because the model was
-                fitted to the dropped projections, too. None: the fit keeps all projections.
+            kept: numbers, in order, of the projections that the fit keeps; `data` then contains only these projections.
+                The fit drops all other projections. The learning rates then start again from their first values,
+                because the model was fitted to the dropped projections, too. None: the fit keeps all projections.
 
         Raises:
             ValueError: as for `add_views`, or there are no projections; nothing is changed.

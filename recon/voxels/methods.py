@@ -45,9 +45,9 @@ class FistaTv(HalfVoxels):
     30 projections. Memory: 8 volumes and 2 times the projections.
 
     The number of dual steps was chosen on a cathode of 512 columns, on whole voxels (tests/bench/ends.py). From 45
-    projections, the volume of this cathode does not converge in 60 iterations with 3 dual steps (22.8 dB), but in 45
-    iterations with 12 dual steps (23.3 dB). From 180 projections, the volume of the cathode converges in 27 iterations
-    with 3 dual steps and in 19 iterations with 12.
+    projections, the volume of this cathode has not converged after 60 iterations with 3 dual steps (22.8 dB), but
+    converges in 45 iterations with 12 dual steps (23.3 dB). From 180 projections, the volume of the cathode converges
+    in 27 iterations with 3 dual steps and in 19 iterations with 12 dual steps.
 
     Attributes:
         iterations: largest number of iterations over all projections.
@@ -83,8 +83,8 @@ class FistaTv(HalfVoxels):
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
 
     def refit(self, share: float) -> VoxelMethod:
-        """The method that computes the refits for error bars: `EarlyTv` with `share` times the default number of
-        iterations of `EarlyTv`, or `share` times the number of this method, if that is smaller.
+        """The method that computes the refits for error bars: `EarlyTv` with the fraction `share` of its default number
+        of iterations, or of the number of iterations of this method, whichever is smaller.
         """
         iterations = max(1, round(share * min(self.iterations, EarlyTv.iterations)))
         return EarlyTv(iterations, self.tv_weight, allow_negative=self.allow_negative)
@@ -92,8 +92,8 @@ class FistaTv(HalfVoxels):
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """How well this method predicts the held-out projections of `trial`.
 
-        The method uses the weight `tv_weight`; if it is None, it uses the best weight that the trial has found. A
-        trial never uses half voxels, because it computes the held-out projections from voxels as wide as a pixel.
+        The method uses the weight `tv_weight`; if `tv_weight` is None, the method uses the best weight that the trial
+        has found. The held-out projections are always computed from voxels as wide as a pixel, not from half voxels.
         """
         if self.tv_weight is not None or trial.weight is None:
             return trial.predicted(with_halves(self, False))
@@ -173,7 +173,7 @@ class OsSirtTv(VoxelMethod):
         tv_weight: threshold of the proximal step in density units; None: chosen by held-out projections or from the
             noise, see `choose_weight`.
         still: as in `FistaTv`.
-        momentum: False: without momentum; the volume then needs about three times as many iterations.
+        momentum: False: without momentum; the volume then needs about three times as many iterations as with momentum.
     """
 
     name: ClassVar[str] = "os-sirt-tv"
@@ -281,7 +281,8 @@ class PnpDct(VoxelMethod):
         return {}
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """How well PnP-DCT predicts the held-out projections with `patch_threshold`; None: with the best threshold.
+        """How well PnP-DCT predicts the held-out projections with `patch_threshold`, or with the best threshold if
+        `patch_threshold` is None.
 
         If the sample is wider than the field of view, PnP-DCT is not tried (see `Trial.wide`), unless it is the first
         method or the caller gave a threshold.

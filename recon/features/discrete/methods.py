@@ -59,16 +59,16 @@ class Discrete(HalfVoxels):
 
     Held-out projections choose the number of levels, their values, and the factor on the FISTA-TV weight μ. If no
     discrete levels pass all tests with held-out projections (see `MaterialTrial.choose`), the result is the FISTA-TV
-    volume. If there are too few projections to hold some out, it is also the FISTA-TV volume, unless `levels` are
-    given: then voxels are pulled weakly to these levels. If the caller gives a volume to start from, the method uses
-    total variation alone.
+    volume. If there are too few projections to hold some out, the result is also the FISTA-TV volume, unless `levels`
+    are given: then voxels are pulled weakly to these levels. If the caller gives a volume to start from, the method
+    uses total variation alone.
 
     Attributes:
         iterations: largest number of iterations over all projections, not counting the FISTA-TV iterations before them.
         levels: densities of the materials in 1/mm, ascending; None: found by expectation maximisation (EM).
         still, half_voxels: as in `FistaTv`.
-        few: if levels were found, half voxels are used for fewer projections than this number times the columns;
-            without levels, the rule of `FistaTv` holds.
+        few: half voxels are used only if there are fewer projections than `few` times the number of columns; if no
+            levels were found, the limit of `FistaTv` holds instead.
     """
 
     name: ClassVar[str] = "discrete"
@@ -92,8 +92,8 @@ class Discrete(HalfVoxels):
             raise ValueError(f"levels must be two or more values in ascending order, got {self.levels}")
 
     def refit(self, share: float) -> VoxelMethod:
-        """The method of the refits for error bars: `EarlyTv`. It makes the fraction `share` of 16 iterations, because
-        error bars were calibrated with 16 iterations.
+        """The method of the refits for error bars: `EarlyTv`. The refit makes the fraction `share` of 16 iterations,
+        because error bars were calibrated with 16 iterations.
         """
         return EarlyTv(iterations=max(1, round(share * _REFIT_SWEEPS)), allow_negative=self.allow_negative)
 
@@ -104,10 +104,10 @@ class Discrete(HalfVoxels):
 
     @property
     def refused_sweeps(self) -> int:
-        """Iterations that the tests of discrete levels usually take before they reject the levels, at most.
+        """Largest number of iterations that the tests of discrete levels usually make before they reject the levels.
 
-        The forecast of a Gaussian fit adds this number: if its voxel refinement rejects the levels, it tries PnP-DCT
-        after these tests.
+        The forecast of the time of a Gaussian fit includes these iterations: the voxel refinement after the fit tries
+        PnP-DCT only after its tests have rejected the levels.
         """
         return _TRIALS_TO_REJECT * self.usual_sweeps
 
@@ -116,8 +116,8 @@ class Discrete(HalfVoxels):
         """[material, z, y, x] probability that a voxel belongs to a material, in ascending order of the levels.
 
         The probabilities of a voxel add up to less than 1; the difference from 1 is the probability that the voxel is a
-        partial-volume voxel. The result is None if `settings` contains no discrete levels, because the volume was not
-        pulled to any.
+        partial-volume voxel. The result is None if `settings` contains no discrete levels, because the volume was then
+        not pulled to any levels.
         """
         fields: list[Any] = [settings.get(name + _OF, ()) for name in MaterialPrior._fields]
         if not len(fields[0]):
@@ -136,8 +136,8 @@ class Discrete(HalfVoxels):
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """How well the method predicts held-out projections: with the best discrete levels, or with total variation
-        alone if no levels are better. If a simpler candidate already has the volume of total variation alone, the
-        method counts as not tried.
+        alone if no levels are better. If no levels are better, and a simpler candidate has already predicted with total
+        variation alone, the method counts as not tried.
         """
         if trial.weight is None:
             return Prediction(
@@ -186,7 +186,8 @@ class Discrete(HalfVoxels):
         )
 
     def half_voxel_weight_of(self, trial: Trial, prior: Prior) -> float:
-        """As for other methods, with the levels of the prior if it has any."""
+        """The weight that `best_half_voxel_weight` finds: with the levels of the prior if it has levels, otherwise as
+        in `HalfVoxels`."""
         materials = prior.materials
         if materials is None or not materials.levels:
             return super().half_voxel_weight_of(trial, prior)
@@ -196,7 +197,7 @@ class Discrete(HalfVoxels):
         self, problem: VoxelProblem, weight: TvWeight, trial: Callable[[], Trial | None]
     ) -> MaterialPrior | None:
         """The grey levels in the units of the problem. The result is None if discrete levels do not predict held-out
-        projections better. The levels are found once and then reused.
+        projections better than total variation alone. The levels are found once and then reused.
 
         Args:
             weight: weight of total variation.

@@ -128,11 +128,12 @@ class AsdPocs(VoxelMethod):
     projections.
 
     Attributes:
-        goal: relative residual ||A x - p|| / ||p|| at which the TV steps are no longer shortened. If `goal` is None, it
-            is 0.15 times the residual of filtered back-projection (FBP or FDK). FDK cannot reconstruct a short cone
-            scan. For a short cone scan the goal is 0.15 times the residual after one iteration of ordered-subset SIRT.
-            The residual after one iteration of ordered-subset SIRT is similar to the residual of FDK: with 20 to 180
-            projections of a box in a box, and 0 or 2 % noise, it is 0.085 to 0.12 for SIRT and 0.075 to 0.11 for FDK.
+        goal: relative residual ||A x - p|| / ||p|| at which the TV steps are no longer shortened. If `goal` is None,
+            the goal is 0.15 times the residual of filtered back-projection (FBP or FDK). FDK cannot reconstruct a short
+            cone scan. For a short cone scan the goal is 0.15 times the residual after one iteration of ordered-subset
+            SIRT. The residual after one iteration of ordered-subset SIRT is similar to the residual of FDK: with 20 to
+            180 projections of a box in a box, and 0 or 2 % noise, the residual is 0.085 to 0.12 for SIRT and 0.075 to
+            0.11 for FDK.
     """
 
     name: ClassVar[str] = "asd-pocs"

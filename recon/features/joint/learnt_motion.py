@@ -190,7 +190,7 @@ def register_energies(
     absorption at another energy, predicts the projections at that energy. Six parameters describe how measured
     projections differ from predicted ones (see `recon.voxels.displacement`): the sample is shifted along x, y and z and
     rotated about the axis; the image is shifted along the rows and magnified. The six parameters are found from the
-    edges in the projections. Therefore a material may absorb differently at two energies.
+    edges in the projections, so it does not matter if a material absorbs differently at two energies.
 
     Returns:
         The projections (interpolated if their magnification differs), and the displacement at each energy. All

@@ -92,8 +92,8 @@ class TimedVolumes:
             applied (`at` gives the displaced volume).
         grid: grid of each volume.
         residual: norm of the residual of the projections, divided by the norm of the projections.
-        motion: displacement field of the sample in time; a voxel of the displaced volume gets the value at its own
-            place plus the displacement; None: nothing moves.
+        motion: displacement field of the sample in time; a voxel of the displaced volume gets the value at the position
+            of the voxel plus the displacement; None: nothing moves.
         unseen_residuals: residuals of coarse volumes in held-out projections, without motion and with motion; None if
             held-out projections did not decide about motion.
         smooth: smoothness of the factors (module `proportions`), if each volume is the mean volume multiplied by smooth
@@ -141,17 +141,17 @@ def fit_series(
         min ½ Σ_v |A_v W(t_v) Σ_k h_k(t_v) x_k - p_v|² + Σ_j μ_j TV(z_j),    x_k >= 0.
 
     The functions h_k are hat functions, so the volume is linear in time between knots. The operator W displaces the
-    volume, smoothly in space and time, and is the identity in the middle of the scan (module `motion`). Mathematically
-    this is the problem of `fit_materials`: knots replace the materials, and hat functions replace the cross sections.
-    The z_j are the orthonormal components of all volumes x_k; the first component is the common part of all volumes. If
-    nothing moves, `fit_series` also tries another model: each volume is the mean volume, multiplied in each voxel by a
-    factor that varies smoothly in space. `fit_series` returns the volumes of this model if they predict held-out
-    projections better than separate volumes do. Smooth factors suit a sample of particles in which each particle takes
-    up or loses material at its own time. Steps, memory, `go_on` and `stop` of `fit_series` are as in `fit_materials`.
-    Up to four tests come before the fit: they choose the weights, decide whether the sample moves, estimate the motion,
-    and choose the smoothness of the factors. During each test, and while the factors are fitted, the first argument of
-    `go_on` counts the remaining steps down to 0. If `go_on` ends the fit of the factors early, the result is the
-    volumes without factors.
+    volume, smoothly in space and time, and is the identity in the middle of the scan (module `motion`). Mathematically,
+    `fit_series` solves the problem of `fit_materials`: knots replace the materials, and hat functions replace the cross
+    sections. The z_j are the orthonormal components of all volumes x_k; the first component is the common part of all
+    volumes. If nothing moves, `fit_series` also tries another model: each volume is the mean volume, multiplied in each
+    voxel by a factor that varies smoothly in space. `fit_series` returns the volumes of this model if they predict
+    held-out projections better than separate volumes do. Smooth factors suit a sample of particles in which each
+    particle takes up or loses material at its own time. Steps, memory, `go_on` and `stop` of `fit_series` are as in
+    `fit_materials`. Up to four tests come before the fit: they choose the weights, decide whether the sample moves,
+    estimate the motion, and choose the smoothness of the factors. During each test, and while the factors are fitted,
+    the first argument of `go_on` counts the remaining steps down to 0. If `go_on` ends the fit of the factors early,
+    the result is the volumes without factors.
 
     Use `motion=True` for a sample that settles. If only the densities of the sample change, `motion=True` finds motion
     that does not exist. For a sample that does not change, `tv_weight` has the same effect as the same weight for a

@@ -56,7 +56,7 @@ class Materials:
         y, x], 0 to 1. For example, the share of a charged material is the state of charge of a battery electrode.
 
         Args:
-            least: a share is computed where the densities of all these materials add up to this value or more;
+            least: a share is computed where the densities of the materials `of` and `others` add up to `least` or more;
                 voxels with a smaller sum get NaN.
         """
         part = self.densities[of]
@@ -82,9 +82,10 @@ def fit_materials(
     The singular value decomposition of the cross sections is U S Vᵀ (each energy weighted by its number of
     projections). The densities of the materials are V S⁻¹ z. The columns of U are orthonormal, so all components z_k
     have the same noise, and the fit is as well conditioned as a fit at a single energy. An iteration takes as long as
-    it would for the same number of projections at a single energy. Each iteration makes the steps of `ordered_fista`.
-    After each step, densities below 0 are set to 0. Long & Fessler (2014, IEEE TMI 33, 1614) also fit the densities of
-    materials to spectral projections in one step. Memory: seven volumes per material, three times the projections.
+    an iteration for the same number of projections at a single energy. Each iteration makes the steps of
+    `ordered_fista`. After each step, densities below 0 are set to 0. Long & Fessler (2014, IEEE TMI 33, 1614) also fit
+    the densities of materials to spectral projections in one step. Memory: seven volumes per material, three times the
+    projections.
 
     During the test reconstructions for the weights, the first argument of `go_on` is -n, where n is the number of
     iterations that may still follow (at most `TRIAL_SWEEPS`).
