@@ -184,7 +184,8 @@ class ScanSection(Section):
     )
     energy: Kev | None = setting(
         None,
-        "keV to which devices.monochromator moves before the first frame; null: the monochromator stays where it is.",
+        "Photon energy in keV to which devices.monochromator moves before the first frame; null: the monochromator "
+        "stays where it is.",
     )
     energies: tuple[Kev, ...] | None = setting(
         None,

@@ -161,7 +161,7 @@ def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames
         limit = max(LIT * intensity, LIT_SIGMAS * place_noise(base.blocks))
         if (above := levels[levels - lowest > limit] - lowest).size:
             bad_frames = [same[index] for index in np.flatnonzero(levels - lowest > limit).tolist()]
-            least_dark = f"the darkest dark, frame {base.row} with {lowest:.6g}"
+            least_dark = f"the darkest dark, frame {base.row} with {lowest:.6g} counts"
             yield BadFrames(bad_frames, float(above.max()), limit, (
                 f"these darks were exposed to the beam, or the offset changed: the darks are {range_in_words(above)} "
                 f"counts "
@@ -219,10 +219,10 @@ def _beam_lost(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrame
     for group in evidence.of_kind(FLAT):
         lost_share = np.array([1 - evidence.intensity_of([flat]) / evidence.intensity_of(bright) for flat in group])
         if (lost_share > limit).any():
-            others, largest_loss = spans([flat.row for flat in bright]), float(lost_share.max())
+            bright_frames, largest_loss = spans([flat.row for flat in bright]), float(lost_share.max())
             sentence = (
-                f"the beam was lost: these flats have {largest_loss:.0%} less intensity than the flats {others} (limit "
-                f"{limit:.0%})."
+                f"the beam was lost: these flats have {largest_loss:.0%} less intensity than the flats in frames "
+                f"{bright_frames} (limit {limit:.0%})."
             )
             yield BadFrames(
                 [group[place] for place in np.flatnonzero(lost_share > limit).tolist()], largest_loss, limit, sentence

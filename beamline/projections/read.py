@@ -105,11 +105,11 @@ def damaged_frames(scan: SelectedScan, frames: NDArray[np.int64]) -> tuple[NDArr
     damaged = np.isin(frames, sorted(source.damaged)) & ~unreadable
     used = scan.selection.step(Preparation).uses_flags
     if damaged.any():
-        taken = "left out" if used else "used anyway (--flags ignore)"
         which = frames_text(np.sort(frames[damaged]))
-        differ = "differs" if damaged.sum() == 1 else "differ"
+        differ, are = ("differs", "is") if damaged.sum() == 1 else ("differ", "are")
+        are_taken = f"{are} left out" if used else f"{are} used anyway (--flags ignore)"
         sentences.append(
-            f"Look for an intact copy of {source.path}: {which} {differ} from the stored checksum, {taken}."
+            f"Look for an intact copy of {source.path}: {which} {differ} from the stored checksum and {are_taken}."
         )
     return unreadable | damaged if used else unreadable, sentences
 

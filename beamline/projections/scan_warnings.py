@@ -106,14 +106,14 @@ def cut_sentence(sides: dict[str, float], continued: bool, wide: bool) -> str:
 
 def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str:
     """The warning for a sample that is inside the field of view only in some projections, see `FieldEdges.passing`."""
-    words = " and ".join(
+    where = " and ".join(
         f"at the {side} edge in projections {first} to {last}" for side, (first, last) in ranges.items()
     )
     return (
-        "Centre the sample on the rotation axis, or move the camera until the axis is near an edge of the detector "
-        f"and take a 360° scan: the sample leaves the field of view {words} of {n_views} and is inside the field of "
-        "view in the other projections. The sample, or a part of it, is off the rotation axis. Material farther "
-        "from the axis than the edge of the detector is not reconstructed, and the rim of the volume is uncertain."
+        "Centre the sample on the rotation axis, or move the camera until the axis is near an edge of the detector and "
+        f"take a 360° scan: the sample leaves the field of view {where} of {n_views} and is inside the field of view "
+        "in the other projections. The sample, or a part of it, is off the rotation axis. Material farther from the "
+        "axis than the edge of the detector is not reconstructed, and the rim of the volume is uncertain."
     )
 
 

@@ -18,9 +18,9 @@ NAMED = 5  # largest number of projections that a sentence names
 DOUBTFUL = 0.2  # steps; a larger possible error of an angle is reported
 TRIES = 3  # number of exposures with the stage at a wrong angle, after which the projection counts as missing
 OFF_TARGET_ADVICE = (
-    "A frame exposed at a wrong angle is kept as an invalid row, and its projection is taken again, up to "
-    f"{TRIES} times in total. Possible causes are another program or person that moves the stage, its manual "
-    "knob, a servo that oscillates, or a controller that reports the end of a move too early"
+    f"A frame exposed at a wrong angle is kept as an invalid row, and its projection is taken again, up to {TRIES} "
+    "times in total. Possible causes are another program or person that moves the stage, the manual knob of the stage, "
+    "a servo that oscillates, or a controller that reports the end of a move too early"
 )
 
 ExposedFrame = tuple[CameraFrame, int, float, bool]
@@ -150,8 +150,8 @@ def _block_discrepancies(tally: BlockTally) -> str:
         )
     if text and tally.largest_residual > DOUBTFUL:
         text += (
-            f" A frame arrived {tally.largest_residual:.2f} periods away from its trigger, so its angle may be wrong "
-            "by the same fraction of an angular step (the warnings of the check `timing` list the frames that came "
-            "early or late)."
+            f" A frame arrived {tally.largest_residual:.2f} periods away from its trigger, so the angle of this frame "
+            "may be wrong by the same fraction of an angular step (the warnings of the check `timing` list the frames "
+            "that came early or late)."
         )
     return text.strip()

@@ -84,7 +84,7 @@ def test_any_kind_of_array_gives_the_same_volume(noisy: np.ndarray, kind: Callab
         ({"projections": np.zeros((24, 20, 40))}, "no material"),
         ({"method": R2(early_stop=True)}, "needs held-out projections"),
         ({"use": DataUse(held_out=(24,))}, "projection numbers 0 to 23"),
-        ({"use": DataUse(held_out=tuple(range(24)))}, "none is left"),
+        ({"use": DataUse(held_out=tuple(range(24)))}, "no projection is left"),
         ({"control": RunControl(resume={})}, "not the checkpoint"),
         ({"device": "abacus"}, "got 'abacus'"),
         ({"seed": -1}, "seed"),

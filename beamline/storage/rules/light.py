@@ -204,8 +204,8 @@ def _exposures_in_words(scan: ScanEvidence, *rows: NDArray[np.int64]) -> str:
         words = [f"{np.median(each):g} s" for each in exposures]
         return f"Stated exposures: flats {words[0]}, projections {words[1]}."
     return (
-        "Check whether flats and projections had the same exposure time: the file does not state it for both. If the "
-        "exposure times differ, the line integrals are wrong."
+        "Check whether flats and projections had the same exposure time: the file does not state both exposure times. "
+        "If the exposure times differ, the line integrals are wrong."
     )
 
 
@@ -287,7 +287,7 @@ def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
         flats_stated = bool((flats > 0).all())
         flat_exposures = scan.exposures[scan.table.flats]
         assumed_exposure = np.nan_to_num(flat_exposures, nan=usual).max(initial=0.0)
-        doubt = f"scaled to {usual:g} s" + (
+        scaling = f"scaled to {usual:g} s" + (
             "."
             if flats_stated
             else f". The file does not state the exposure of the flats. The program assumes {assumed_exposure:g} s, "
@@ -297,8 +297,8 @@ def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "info" if flats_stated else "warning",
             "exposures",
-            f"The projections were exposed for {views.min():g} to {views.max():g} s; the intensity of each "
-            f"projection is {doubt}",
+            f"The projections were exposed for {views.min():g} to {views.max():g} s; the intensity of each projection "
+            f"is {scaling}",
         )
     darks = darks[darks > 0]
     if darks.size and np.ptp(darks) <= EXPOSURE_TOLERANCE * usual < np.abs(darks - usual).max():  # never true for NaN

@@ -111,9 +111,9 @@ def central_ray_taken(scan: ScanEvidence) -> Iterator[Finding]:
             yield Finding(
                 "warning",
                 f"central-{side}",
-                f"Give {option} {position:.6g} if the file is right: it states that the central ray meets "
-                f"{side} {position:.6g} (beam_center, from the centre of the first of {n}). The reconstruction "
-                f"assumes {taken}.",
+                f"Give {option} {position:.6g} if the file is right: the file states that the central ray meets {side} "
+                f"{position:.6g} (beam_center, counted from the centre of the first of {n} {side}s). The "
+                f"reconstruction assumes {taken}.",
             )
 
 

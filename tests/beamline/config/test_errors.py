@@ -106,7 +106,8 @@ FAULTS = {
     ),
     "counterpart of another stage": (
         ("kind: pm16c", "kind: pi_gcs"),
-        "my.yaml:7: devices.stage: port sim://pm16c is not the simulated counterpart of pi_gcs, sim://pi_gcs",
+        "my.yaml:7: devices.stage: port sim://pm16c does not fit kind pi_gcs; expected sim://pi_gcs, the simulated "
+        "controller of this kind",
     ),
     "a stage without a simulated controller": (
         ('kind: pm16c, port: "sim://pm16c"', 'kind: zaber, port: "sim://zaber"'),

@@ -27,7 +27,7 @@ from tests.beamline.ran import Ran
     [
         (210, 200, Faults(), "The flats 3-4: these flats show no beam"),
         (20000, 15000, Faults(), "The darks 0-2: these darks were exposed to the beam"),
-        (20000, 200, Faults(lost={3, 4}), "The 2 flats planned before the projections were not taken"),
+        (20000, 200, Faults(lost={3, 4}), "The scan did not take the 2 flats that its plan has before the projections"),
     ],
 )
 def test_no_projection_is_taken_after_references_that_cannot_be_used(
