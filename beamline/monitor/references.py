@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beamline.core.flag import Finding, Severity
-from beamline.core.text import spans
+from beamline.core.text import frames_text, spans
 from beamline.monitor.digest import LARGEST
 from beamline.monitor.evidence import (
     BRIGHT,
@@ -120,7 +120,7 @@ def _in_words(name: str, kind: FrameKind, groups: list[BadFrames], severity: Sev
     for sentence in dict.fromkeys(each.sentence for each in groups):
         alike = [each for each in groups if each.sentence == sentence]
         own = tuple(sorted(frame.row for each in alike for frame in each.frames))
-        text = f"The {kind.name.lower()}s {spans(own)}: {sentence}" if own else sentence
+        text = f"{kind.name.capitalize()}s in {frames_text(own)}: {sentence}" if own else sentence
         yield Finding(severity, name, text, own, alike[0].score, alike[0].limit)
 
 
@@ -207,9 +207,9 @@ def _without_beam(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFr
         intensity = level(group) - level(darks)
         if intensity <= limit * noise:
             yield BadFrames(group, intensity / noise if noise else 0.0, limit, (
-                "these flats show no beam. Was the shutter open for the flats, and closed for the darks? The level "
-                f"of these flats, {level(group):.6g}, is {intensity:.3g} above the level of the darks, "
-                f"{level(darks):.6g}; the noise of a pixel is {noise:.2g} (limit: {limit:g} times the noise)."
+                "these flats show no beam. Was the shutter open for the flats, and closed for the darks? The level of "
+                f"these flats, {level(group):.6g} counts, minus the level of the darks, {level(darks):.6g} counts, is "
+                f"{intensity:.3g} counts; expected more than {limit:g} times the noise of a pixel, {noise:.2g} counts."
             ))  # fmt: skip
 
 

@@ -265,11 +265,11 @@ def no_beam_sentence(scan: ScanEvidence, requested: NDArray[np.int64], exposed: 
     if not without_beam.size:
         return ""
     gap = f", which leaves {gap_text}" if (gap_text := new_gap(scan, requested, exposed)) else ""
-    they_are = "It is" if without_beam.size == 1 else "They are"
+    these_are = "This projection is" if without_beam.size == 1 else "These projections are"
     return (
         f"{count(without_beam.size, 'projection')} of {scan.source.table.views.size} ({frames_text(without_beam)}) had "
         "no beam: the shutter was closed, the beam was lost, or these frames were never written to the file. "
-        f"{they_are} left out{gap}."
+        f"{these_are} left out{gap}."
     )
 
 

@@ -87,10 +87,11 @@ def cut_sentence(sides: dict[str, float], continued: bool, wide: bool) -> str:
         continued: True if FBP extrapolates the projections.
         wide: True if the scan has laterally offset projections.
     """
-    fbp = (
-        "FBP extrapolates the projections beyond the detector, and densities are off by tens of per cent. The other"
+    full_width = (
+        "FBP extrapolates the projections beyond the detector, and densities are off by tens of per cent. The other "
+        "methods reconstruct the full width of the sample."
         if continued
-        else "Iterative"
+        else "Iterative methods reconstruct the full width of the sample."
     )
     advice = (
         "To measure the rest of the sample, take offset projections (scan.offset_views, 8 to 16 more "
@@ -98,9 +99,9 @@ def cut_sentence(sides: dict[str, float], continued: bool, wide: bool) -> str:
         "acquisition, twice the projections). "
     )
     return (
-        f"{beyond_the_field(sides)} {fbp} methods reconstruct the full width of the sample. "
-        f"{'' if wide else advice}The edge columns are therefore not used as air reference. If the edge columns do "
-        "show air, and only the beam is weaker than in the flats, use --air columns."
+        f"{beyond_the_field(sides)} {full_width} {'' if wide else advice}The edge columns show the sample, so they are "
+        "not used as air reference. If the edge columns do show air, and only the beam is weaker than in the flats, "
+        "use --air columns."
     )
 
 

@@ -88,7 +88,7 @@ def test_any_kind_of_array_gives_the_same_volume(noisy: np.ndarray, kind: Callab
         ({"control": RunControl(resume={})}, "not the checkpoint"),
         ({"device": "abacus"}, "got 'abacus'"),
         ({"seed": -1}, "seed"),
-        ({"geometry": VIEWS.at(np.pi * np.arange(24) + 0.3)}, "got 24 from one side"),
+        ({"geometry": VIEWS.at(np.pi * np.arange(24) + 0.3)}, "got only one direction"),
         ({"geometry": replace(VIEWS, axis_col=60.0)}, "column 60, is outside the detector's columns 0 to 39, .*crop"),
         ({"geometry": replace(VIEWS, axis_col=-0.6)}, "columns 0 to 39"),
     ],

@@ -90,7 +90,7 @@ def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source:
     if value.dtype.kind not in "uifb":
         return "the field is text; expected a number, with a known unit after the number or in the attribute `units`"
     unit = datasets.attribute(item, "units")
-    return f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
+    return f"its units {unit!r} are not known here" if unit else "it has no attribute `units`, so its unit is unknown"
 
 
 def _varying(field: Entry, item: h5py.Dataset, source: ScanSource) -> tuple[str, float]:

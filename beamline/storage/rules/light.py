@@ -179,7 +179,7 @@ def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
             "only add counts. Were the darks taken with beam, with another gain or exposure, or stored "
             "as sums of frames? Give --darks with the settings of the projections."
         )
-        sentence += "" if scan.request.accepted else " --references accept uses these as they are."
+        sentence += "" if scan.request.accepted else " --references accept uses the darks as they are."
         yield Finding("warning" if scan.request.accepted else "error", "light", sentence)
 
 

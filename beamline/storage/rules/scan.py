@@ -190,7 +190,8 @@ class Row:
 Rule = Callable[[ScanEvidence], Iterator[Finding]]
 RULES: tuple[Rule, ...] = (
     Row("error", "views", lambda scan: (n := scan.table.views.size) < 2 and (
-        f"The scan has {count(n, 'projection')}; a reconstruction needs at least 2, a good one hundreds."
+        f"The scan has {count(n, 'projection')}; a reconstruction needs at least 2 projections, and a good "
+        "reconstruction needs hundreds."
     )),
     Row("error", "angles", angles_unknown),
     Row("warning", "angles", lambda scan: (where := scan.source.attributes.get("angles_reversed")) and (

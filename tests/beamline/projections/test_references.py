@@ -49,13 +49,13 @@ def source(
     ("end", "said"),
     others_slow(
         [
-            ((DARK, DARK + 2), "The flats 54-56: these flats show no beam"),
+            ((DARK, DARK + 2), "Flats in frames 54-56: these flats show no beam"),
             (
                 (DARK, DARK + 0.02 * BEAM),
-                "The flats 54-56: the beam was lost: these flats have 98% less intensity than the flats 3-5",
+                "Flats in frames 54-56: the beam was lost: these flats have 98% less intensity than the flats",
             ),
-            ((DARK, FULL + 3000), "The flats 54-56: 100.00% of the pixels are saturated"),
-            ((DARK + 0.9 * BEAM, DARK + BEAM), "The darks 51-53: these darks were exposed to the beam"),
+            ((DARK, FULL + 3000), "Flats in frames 54-56: 100.00% of the pixels are saturated"),
+            ((DARK + 0.9 * BEAM, DARK + BEAM), "Darks in frames 51-53: these darks were exposed to the beam"),
         ]
     ),
 )
@@ -73,9 +73,9 @@ def test_a_bad_group_at_the_end_is_left_out(end: tuple[float, float], said: str)
     ("levels", "said"),
     others_slow(
         [
-            ((DARK, FULL + 2000), "The flats 3-5, 54-56: .* of the pixels are saturated"),
-            ((DARK, DARK + 2), "The flats 3-5: these flats show no beam"),
-            ((DARK + 0.9 * BEAM, DARK + BEAM), "The darks 0-2: these darks were exposed to the beam"),
+            ((DARK, FULL + 2000), "Flats in frames 3-5, 54-56: .* of the pixels are saturated"),
+            ((DARK, DARK + 2), "Flats in frames 3-5: these flats show no beam"),
+            ((DARK + 0.9 * BEAM, DARK + BEAM), "Darks in frames 0-2: these darks were exposed to the beam"),
         ]
     ),
 )

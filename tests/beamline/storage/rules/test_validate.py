@@ -187,7 +187,10 @@ DEGREES = np.arange(0, 180, 2.0)
         (DEGREES[np.random.default_rng(0).permutation(90)] * 1000, "look like counts of an encoder"),
         (DEGREES * 65536 / 360, "0 to 32403.9 degrees in steps of 364.1"),
         (np.arange(90) * 360.0, "0 to 32040 degrees in steps of 360"),
-        (np.radians(DEGREES), "span only 3.107 degrees: these look like radians: 180 degrees are 3.1416"),
+        (
+            np.radians(DEGREES),
+            "span only 3.107 degrees, so the angles look like radians, in which 180 degrees are 3.1416",
+        ),
         (np.radians(2 * DEGREES), "radians: 360 degrees are 6.2832"),
         (np.radians(np.linspace(-90, 90, 9)), "radians: 180 degrees are 3.1416"),
         (DEGREES / 360, "span only 0.4944 degrees: these look like radians or turns"),
