@@ -123,7 +123,7 @@ def check_air_level(scan: ScanEvidence, level: float, air: bool, accepted: bool 
         factor = math.exp(abs(level))
         dark_or_bright = "dark" if level > 0 else "bright"
         sentence = (
-            f"{place_text} is {factor:.3g} times as {dark_or_bright} as the flats ({level:+.2f} in line integral, "
+            f"{place_text} is {factor:.3g} times as {dark_or_bright} as the flats ({level:+.2f} in line integral; "
             f"{use_text}). During one scan a beam changes by a factor of up to {math.exp(WARN):.2g}, and a sample can "
             "only absorb. Were the projections, flats and darks taken with the same settings and stored in the same "
             f"way? {_counts_in_words(scan)}"
