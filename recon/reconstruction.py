@@ -189,8 +189,9 @@ def _refuse_geometry(geometry: Geometry) -> None:
     scaled_angle = (geometry.angles - geometry.angles[0]) / (2 if geometry.is_cone or geometry.tilt.any() else 1)
     if np.abs(np.sin(scaled_angle)).max() < 1e-6:
         raise ValueError(
-            "give projections at two or more different angles, because one direction does not determine a volume; got "
-            f"only one direction, {np.rad2deg(geometry.angles[0]):g} degrees (in {geometry.n_views} projections)"
+            "give projections at two or more different angles, because one direction does not determine a volume; "
+            f"got only one direction, {np.rad2deg(geometry.angles[0]):g} degrees (number of projections: "
+            f"{geometry.n_views})"
         )
     if sentence := unseen_axis(geometry.axis_col + geometry.offsets[:, 0], geometry.detector_shape[1]):
         raise ValueError(sentence)

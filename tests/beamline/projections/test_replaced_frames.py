@@ -73,7 +73,7 @@ def test_flats_with_the_sample_in_are_known_at_the_start_between_and_at_the_end(
     view = (0, VIEWS // 2, VIEWS - 1)[at]
     blocks.of(FLAT)[at][:] = blocks.taken(np.repeat(line_integrals(scale)[view : view + 1], 3, axis=0))
     found, told = decibels(blocks.source(), scale)
-    assert told[0].startswith("The flats ") and "in the beam" in told[0]
+    assert told[0].startswith("Flats in frames ") and "in the beam" in told[0]
     assert found > clean(3, 3, scale) - 0.5
 
 
@@ -97,7 +97,7 @@ def test_flats_through_anything_else_are_known_by_places_that_the_views_outshine
     blocks.of(FLAT)[at][:] = _flats_through(blocks, what)
     found, (line,) = decibels(blocks.source())
     rows = (3, 5) if at == 0 else (6 + VIEWS + 3, 6 + VIEWS + 5)
-    assert line.startswith(f"The flats {rows[0]}-{rows[1]}: the sample, or something else, was in the beam")
+    assert line.startswith(f"Flats in frames {rows[0]}-{rows[1]}: the sample, or something else, was in the beam")
     assert found > clean(2, 3) - 0.5
 
 
@@ -105,7 +105,7 @@ def test_a_group_of_flats_alone_with_the_sample_in_is_refused() -> None:
     """The views outshine them in places, and hold no more matter elsewhere."""
     blocks = Blocks(1, 3)
     blocks.of(FLAT)[0][:] = blocks.of(VIEW)[0][20:23]
-    with pytest.raises(DataError, match=r"flats 4-5: the sample was in the beam"):
+    with pytest.raises(DataError, match=r"Flats in frames 4-5: the sample was in the beam"):
         decibels(blocks.source())
 
 
