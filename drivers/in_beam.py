@@ -122,7 +122,7 @@ class StageSampleMover:
         self._motor.put(INSIDE, aside * self._rad_per_mm if aside else 0.0)
 
 
-NOT_KNOWN = "It is not known whether the shutter is open: check it before anybody goes near the beam"
+NOT_KNOWN = "It is not known whether the shutter is open: check the shutter before anybody goes near the beam"
 
 
 class OutputShutter:

@@ -140,7 +140,9 @@ def build(method: type[Method], settings: Mapping[str, Any]) -> Method:
         if not has_setting(method, name):
             if not (owners := ", ".join(taking(name))):
                 raise ValueError(unknown(f"setting of {method.name}", name, setting_names(method())))
-            raise ValueError(f"method {method.name!r} has no setting {name!r}; these methods have it: {owners}")
+            raise ValueError(
+                f"method {method.name!r} has no setting {name!r}; methods that have this setting: {owners}"
+            )
     built: Method = with_settings(method(), settings)
     return built
 

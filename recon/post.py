@@ -107,6 +107,6 @@ def _fitted(sample: F64, k: int, seed: int) -> tuple[F64, float]:
             best = centres, inertia
     if best is None:
         raise ValueError(
-            f"k-means found no {k} clusters in {sample.size} grey values from {sample.min():g} to {sample.max():g}"
+            f"k-means did not find {k} clusters in {sample.size} grey values from {sample.min():g} to {sample.max():g}"
         )
     return best

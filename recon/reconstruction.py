@@ -143,8 +143,8 @@ def _warn_of_unseen_cone(method: Method, geometry: Geometry) -> None:
             "set the weight of total variation yourself: use fista-tv with tv_weight 0.001, or with 0.002 for a plate "
             "with sharp edges. The automatic weight is too small for this scan. The rotation axis is tilted along the "
             f"beam by {math.degrees(lean):.3g} degrees or more in all projections, so no projection shows the faces of "
-            "a plate that lies across the axis. The held-out projections, which choose the weight, do not show them "
-            "either",
+            "a plate that lies across the axis. The held-out projections, which choose the weight, do not show these "
+            "faces either",
             stacklevel=3,
         )
 
@@ -175,9 +175,9 @@ def _warn_of_half_acquisition(views: Views) -> None:
         warnings.warn(
             "take projections over 360 degrees without a gap, or do not rely on the densities: the sample reaches "
             f"beyond the edge of the detector that is {min(columns_left, columns_right):.0f} columns from the rotation "
-            "axis, and only a full circle shows all rays that are farther from the axis. Without a full circle, "
-            "densities in our tests were too low: by up to a third with FBP, by up to an eighth with iterative methods "
-            "(docs/numerics.md)",
+            "axis, and only a full circle shows all rays that are farther from the axis than this edge. Without a full "
+            "circle, densities in our tests were too low: by up to a third with FBP, by up to an eighth with iterative "
+            "methods (docs/numerics.md)",
             stacklevel=3,
         )
 
@@ -190,7 +190,8 @@ def _refuse_geometry(geometry: Geometry) -> None:
     if np.abs(np.sin(scaled_angle)).max() < 1e-6:
         raise ValueError(
             "give projections at two or more different angles, because one direction does not determine a volume; "
-            f"got {geometry.n_views} from one side ({np.rad2deg(geometry.angles[0]):g} degrees)"
+            f"got only one direction, {np.rad2deg(geometry.angles[0]):g} degrees (number of projections: "
+            f"{geometry.n_views})"
         )
     if sentence := unseen_axis(geometry.axis_col + geometry.offsets[:, 0], geometry.detector_shape[1]):
         raise ValueError(sentence)

@@ -106,7 +106,7 @@ def scans_of(plan: Generator[Any, Any, Any]) -> tuple[PlannedScan, ...]:
                 scans.append(replace(planned, needs=replace(planned.needs, volume_seconds=0.0)))
             reply = others.take(message)
         others.faults.append(
-            ScanFault(f"the plan may never end: it sent {MOST} messages, the most that this estimate follows")
+            ScanFault(f"the plan may never end: this estimate stopped after {MOST} messages of the plan")
         )
     except StopIteration:
         pass

@@ -89,8 +89,8 @@ def _require_chosen(run: Path, part: Path, choice: str, before: int) -> None:
         else "the scan has made no other choice"
     )
     raise ConfigError(
-        f"the scan in {run} does not measure {choice} next, because it did not offer this choice or your choice came "
-        f"too late; {instead}."
+        f"the scan in {run} does not measure {choice} next, because the scan did not offer this choice, or because "
+        f"your choice came too late; {instead}."
     )
 
 

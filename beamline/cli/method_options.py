@@ -67,7 +67,7 @@ def row_settings(command: click.Command, methods: Sequence[str], values: dict[st
             methods_with_it = ", ".join(owners)
             option = options[path]
             raise click.UsageError(
-                f"--{option} works only with {methods_with_it}, and no row of the table uses one of these methods."
+                f"--{option} works only with {methods_with_it}; this command uses only {', '.join(methods)}."
             )
     return {method: {path: value for path, value in settings.items() if method in taking(path)} for method in methods}
 
@@ -174,9 +174,9 @@ _FINISH = option(
     setting="finish",
     excludes=EXCLUDED["finish"],
     type=WholeRange(min=0),
-    help="Number of iterations on the voxel volume after the Gaussian fit; they restore edges, cracks and pores. 0: "
-    "none. Default: 8 with total variation, then more with discrete levels or PnP-DCT, if one of these predicts "
-    "held-out projections better.",
+    help="Number of iterations on the voxel volume after the Gaussian fit; these iterations restore edges, cracks and "
+    "pores. 0: none. Default: 8 iterations with total variation, then more with discrete levels or PnP-DCT, if "
+    "discrete levels or PnP-DCT predict held-out projections better.",
 )
 _ITERATIONS = option(
     "--iterations",
@@ -303,8 +303,8 @@ method_options = together(
         excludes=EXCLUDED["start"],
         type=NameChoice(get_args(Start)),
         help="Volume from which the initial Gaussians are sampled. tv: slower, but without the streaks of few "
-        "projections. published: FBP with a plain ramp filter, sampled and weighted as in the paper. Default: fbp; for "
-        "r2-published: published.",
+        "projections. published: FBP with a plain ramp filter, sampled and weighted as in the R²-Gaussian paper. "
+        "Default: fbp; for r2-published: published.",
     ),
     option(
         "--loss",

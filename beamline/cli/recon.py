@@ -110,7 +110,8 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
     built = method_with(method, settings, values["any_setting"])
     if values["region"] is not None and values["max_residual"] is not None and built.makes_boxes:
         raise click.UsageError(
-            "--max-residual needs the whole volume, but fbp with --roi computes only the box. Leave out one of the two."
+            "--max-residual needs the whole volume, but fbp with --roi computes only the box. Leave out one of the two "
+            "options."
         )
     same = {each.name: values[each.name] for each in fields(ReconOptions) if each.name in values}
     return ReconOptions(**same | {
@@ -207,8 +208,8 @@ def run_reconstruction(
     output = str(options.target.output)
     if not values["as_json"]:
         click.echo("\n".join([results(record), *more(record)]))
-    if lost := record.ending.lost_checkpoint:
-        raise DataError(f"The last checkpoint could not be written: {lost} The volume was written: {output}.")
+    if reason := record.ending.lost_checkpoint:
+        raise DataError(f"The last checkpoint could not be written: {reason} The volume was written: {output}.")
     if record.ended_early:
         raise ScanStopped(f"The reconstruction was stopped early. The volume reached so far is in {output}.")
     if limit is not None:  # the limit has no default, because no limit suits every sample

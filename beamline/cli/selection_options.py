@@ -139,8 +139,8 @@ light_options = together(
     option(
         "--photons-per-count",
         excludes={
-            "spectra": "photons are not counted for scans at several energies; the report states their dose "
-            "as a number of frames"
+            "spectra": "photons are not counted for scans at several energies; the report of such a scan states the "
+            "dose as a number of frames"
         },
         type=POSITIVE,
         help="Number of X-ray photons at the sample for one count of the camera.",

@@ -101,14 +101,15 @@ class SimulatedOrca(_Orca):
 
 class DcamOrca(section_of("DcamOrcaKeys", _Orca, declared(DcamOptions))):  # type: ignore[misc]
     kind: Literal["dcam"]
-    library: str | None = setting(None, "Path of the DCAM-API library; null: the installed one.")
+    library: str | None = setting(None, "Path of the DCAM-API library; null: the installed library.")
     index: int = setting(0, "Number of the camera to use (counted from 0), if DCAM finds several cameras.", ge=0)
     link: Literal["usb3", "coaxpress"] = setting(
         "usb3", "USB3 transfers 17.7 full frames per second; CoaXPress transfers 120 full frames per second."
     )
     cool_s: float = setting(
         0.0,
-        "Longest time in s that a scan waits before its start until the sensor is cold; 0: the scan does not wait.",
+        "Before a scan starts, it waits until the sensor is cold, at most for this time in s; 0: the scan does not "
+        "wait.",
         ge=0,
         le=1e6,
     )

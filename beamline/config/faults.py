@@ -75,8 +75,8 @@ def _triggers(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
         yield (
             ("devices", "camera", "trigger_active"),
             "with devices.camera.trigger_active: level, the exposure lasts as long as the pulse. Set "
-            f"devices.stage.pulse_width_s (now {width}) to the value of scan.exposure_s ({scan.exposure_s:g}), or set "
-            "devices.camera.trigger_active to edge",
+            f"devices.stage.pulse_width_s (now {'null' if width is None else width}) to the value of scan.exposure_s "
+            f"({scan.exposure_s:g}), or set devices.camera.trigger_active to edge",
         )
 
 

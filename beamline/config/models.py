@@ -184,7 +184,8 @@ class ScanSection(Section):
     )
     energy: Kev | None = setting(
         None,
-        "keV to which devices.monochromator moves before the first frame; null: the monochromator stays where it is.",
+        "Photon energy in keV to which devices.monochromator moves before the first frame; null: the monochromator "
+        "stays where it is.",
     )
     energies: tuple[Kev, ...] | None = setting(
         None,
@@ -332,6 +333,10 @@ class SimulationSection(Section):
     seed: int = setting(0, ge=0, lt=2**63)
 
 
+def _are(names: list[str]) -> str:
+    return f"{', '.join(names)} {'is' if len(names) == 1 else 'are'}"
+
+
 class Config(Section):
     """The content of a whole configuration file."""
 
@@ -349,12 +354,12 @@ class Config(Section):
     def _all_simulated_or_none(self) -> Self:
         simulated = self.devices.simulated_or_not()
         if any(simulated.values()) and not all(simulated.values()):
-            unreal = ", ".join(name for name, value in simulated.items() if value)
-            real = ", ".join(name for name, value in simulated.items() if not value)
+            unreal = _are([name for name, value in simulated.items() if value])
+            real = _are([name for name, value in simulated.items() if not value])
             few_simulated = 2 * sum(simulated.values()) <= len(simulated)
             odd_one = next(name for name, value in simulated.items() if value is few_simulated)
             raise ValueError(
-                f"devices.{odd_one}: simulated and real devices cannot be mixed, but {unreal} simulated and {real} "
+                f"devices.{odd_one}: simulated and real devices cannot be mixed, but {unreal} simulated, and {real} "
                 "real. Make all devices real or all devices simulated. `beamline scan CONFIG --rehearse` runs a "
                 "configuration for real devices with simulated devices"
             )
@@ -368,7 +373,11 @@ class Config(Section):
     def _filter_is_there(self) -> Self:
         named, known_names = self.scan.filter, list(self.devices.filter.places)
         if named is not None and named not in known_names:
-            legal = f"devices.filter has {', '.join(known_names)}" if known_names else "devices.filter has no places"
+            legal = (
+                f"the places of devices.filter are {', '.join(known_names)}"
+                if known_names
+                else "devices.filter has no places"
+            )
             raise ValueError(f"scan.filter {named!r} is not one of the filter's places; {legal}")
         return self
 

@@ -73,7 +73,10 @@ class StageSection(Section):
                 "rehearse with --rehearse"
             )
         if self.simulated and self.port.lower() != f"sim://{self.kind}":
-            raise ValueError(f"port {self.port} is not the simulated counterpart of {self.kind}, sim://{self.kind}")
+            raise ValueError(
+                f"port {self.port} does not fit kind {self.kind}; expected sim://{self.kind}, the "
+                "simulated controller of this kind"
+            )
         _ = self.settings
         return self
 

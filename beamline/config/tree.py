@@ -297,7 +297,7 @@ REMOVED = {
     "projections 180° apart",
 }
 """Keys of 1.0.0 that were removed, each with a sentence on its replacement."""
-_ADVICE = "A configuration for real devices runs unchanged with simulated ones: `beamline scan CONFIG --rehearse`"
+_ADVICE = "A configuration for real devices runs unchanged with simulated devices: `beamline scan CONFIG --rehearse`"
 
 
 def explain(error: ValidationError, tree: Tree, schema: Schema) -> list[tuple[str, str]]:

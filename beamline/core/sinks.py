@@ -80,7 +80,10 @@ def _of_reconstruction(event: Event) -> str | None:
             views = count(event.n_views, "projection")
             return f"{event.method} {start_text}: {views}, rotation axis at column {event.axis_col:.2f}"
         case TrialsStarted(file, trials=trials, by=by):
-            return f"Starting {count(trials, 'trial')} of {file}; the quality of each volume is measured by {by}"
+            return (
+                f"Starting {count(trials, 'trial reconstruction')} of {file}; the quality of each volume is "
+                f"measured by {by}"
+            )
         case TrialDone():
             return _trial(event)
         case SnapshotWritten(path, n_views=n_views):

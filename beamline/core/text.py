@@ -100,7 +100,7 @@ def with_points(numbers: Sequence[str]) -> list[str]:
     commas, points = ([text.strip() for text in numbers if mark in text] for mark in ",.")
     thousands = all(re.fullmatch(r"[-+]?[1-9]\d{0,2},\d{3}", text) for text in commas)
     if commas and (points or thousands or any(text.count(",") > 1 for text in commas)):
-        with_point = f" beside {one_line(points[0], 40)} with a point" if points and points[0] != commas[0] else ""
+        with_point = f" next to {one_line(points[0], 40)} with a point" if points and points[0] != commas[0] else ""
         first_line = one_line(commas[0], 40)
         raise ValueError(
             f"{first_line} has a comma{with_point}, and it is not clear whether this comma separates decimals: write "

@@ -250,7 +250,9 @@ def _rehearse(camera: SimulatedOrcaQuest) -> None:
     try:
         camera.rehearse()
     except CannotExposeError as error:
-        raise ConfigError(f"simulation.scene cannot be exposed: {error}. Nothing was started.") from error
+        raise ConfigError(
+            f"the simulator cannot compute frames of simulation.scene: {error}. Nothing was started."
+        ) from error
 
 
 def clock_of(kind: str | Speed, not_before: float = 0.0) -> Clock:

@@ -94,15 +94,15 @@ class ScanContext:
     change: SampleChange | None = None
 
 
-AGAIN = "With `monitor.retake: true` in the configuration, the scan repeats at its end the projections with an alarm."
+AGAIN = "With `monitor.retake: true` in the configuration, the scan takes projections with an alarm again at its end."
 """Advice for alarms that usually do not occur again when the projection is repeated."""
 
 
 def again_by(check: str) -> str:
     """Advice for warnings of a check: how to have such projections taken again."""
     return (
-        f"With `monitor.retake: [{check}]` in the configuration, the scan repeats at its end the projections for "
-        "which this check warned."
+        f"With `monitor.retake: [{check}]` in the configuration, the scan takes projections with a warning of this "
+        "check again at its end."
     )
 
 

@@ -117,12 +117,11 @@ class FieldOfViewCheck(Logged):
         left, right = edges
         cut = {side: depth for side, depth in (("left", left), ("right", right)) if depth > self.edge}
         other_side = (
-            " The sample was inside the field of view in earlier projections, so it is not centred on the rotation "
-            "axis: centre it."
+            " Centre the sample on the rotation axis: in earlier projections the sample was inside the field of view."
         ) * (entered and len(cut) == 1)
         advice = (
             f"{beyond_the_field(cut)}{other_side} The sample beyond the edge has three effects: the check `mass` is "
-            "switched off, slow floaters are not detected, and reconstructions are too bright at the rim."
+            "switched off, slow loose particles are not detected, and reconstructions are too bright at the rim."
         )
         rows, last = grid.shape[0] * grid.cell, grid.right + 1
         first = grid.left if left >= right else max(last - 2, 0)

@@ -254,7 +254,7 @@ class LostCheck:
             return CheckResult(state)
         empty = (
             "Look at the file: every pixel of this frame has the same value. The frame was never written, or the "
-            "camera sent none."
+            "camera sent no frame."
         )
         advice = (
             f"Check ring current, front end and shutter: the beam is lost ({score:.0%} of the intensity is gone). "

@@ -176,7 +176,7 @@ class MotionCheck(Logged):
         advice = (
             f"Check for vibration and for runout of the stage: the sample shakes by {across:.2f} px horizontally and "
             f"{down:.2f} px vertically (standard deviation over at most the last 100 projections). The projections can "
-            "still be used: `beamline recon --calibrate shifts` measures and corrects the shift of each one."
+            "still be used: `beamline recon --calibrate shifts` measures and corrects the shift of each projection."
         )
         return CheckResult(replace(state, flagged_shake=size), Flag(self.name, Level.WARN, row, size, limit, advice))
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beamline.core.flag import Finding, Severity
-from beamline.core.text import spans
+from beamline.core.text import frames_text, spans
 from beamline.monitor.digest import LARGEST
 from beamline.monitor.evidence import (
     BRIGHT,
@@ -120,7 +120,7 @@ def _in_words(name: str, kind: FrameKind, groups: list[BadFrames], severity: Sev
     for sentence in dict.fromkeys(each.sentence for each in groups):
         alike = [each for each in groups if each.sentence == sentence]
         own = tuple(sorted(frame.row for each in alike for frame in each.frames))
-        text = f"The {kind.name.lower()}s {spans(own)}: {sentence}" if own else sentence
+        text = f"{kind.name.capitalize()}s in {frames_text(own)}: {sentence}" if own else sentence
         yield Finding(severity, name, text, own, alike[0].score, alike[0].limit)
 
 
@@ -161,7 +161,7 @@ def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames
         limit = max(LIT * intensity, LIT_SIGMAS * place_noise(base.blocks))
         if (above := levels[levels - lowest > limit] - lowest).size:
             bad_frames = [same[index] for index in np.flatnonzero(levels - lowest > limit).tolist()]
-            least_dark = f"the darkest dark, frame {base.row} with {lowest:.6g}"
+            least_dark = f"the darkest dark, frame {base.row} with {lowest:.6g} counts"
             yield BadFrames(bad_frames, float(above.max()), limit, (
                 f"these darks were exposed to the beam, or the offset changed: the darks are {range_in_words(above)} "
                 f"counts "
@@ -207,9 +207,9 @@ def _without_beam(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFr
         intensity = level(group) - level(darks)
         if intensity <= limit * noise:
             yield BadFrames(group, intensity / noise if noise else 0.0, limit, (
-                "these flats show no beam. Was the shutter open for the flats, and closed for the darks? The level "
-                f"of these flats, {level(group):.6g}, is {intensity:.3g} above the level of the darks, "
-                f"{level(darks):.6g}; the noise of a pixel is {noise:.2g} (limit: {limit:g} times the noise)."
+                "these flats show no beam. Was the shutter open for the flats, and closed for the darks? The level of "
+                f"these flats, {level(group):.6g} counts, minus the level of the darks, {level(darks):.6g} counts, is "
+                f"{intensity:.3g} counts; expected more than {limit:g} times the noise of a pixel, {noise:.2g} counts."
             ))  # fmt: skip
 
 
@@ -219,10 +219,10 @@ def _beam_lost(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrame
     for group in evidence.of_kind(FLAT):
         lost_share = np.array([1 - evidence.intensity_of([flat]) / evidence.intensity_of(bright) for flat in group])
         if (lost_share > limit).any():
-            others, largest_loss = spans([flat.row for flat in bright]), float(lost_share.max())
+            bright_frames, largest_loss = spans([flat.row for flat in bright]), float(lost_share.max())
             sentence = (
-                f"the beam was lost: these flats have {largest_loss:.0%} less intensity than the flats {others} (limit "
-                f"{limit:.0%})."
+                f"the beam was lost: these flats have {largest_loss:.0%} less intensity than the flats in frames "
+                f"{bright_frames} (limit {limit:.0%})."
             )
             yield BadFrames(
                 [group[place] for place in np.flatnonzero(lost_share > limit).tolist()], largest_loss, limit, sentence

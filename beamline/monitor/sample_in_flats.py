@@ -63,11 +63,11 @@ def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[BadFrames]
     compared_with, bad_frames = "other flats of their group" if single else "other flats", list[BadFrames]()
     for frames, image, others in compared:
         if others and (nearest_view := _nearest_view(image, others, projections)) is not None:
-            difference, like, nearest = nearest_view
+            difference, difference_from_view, nearest = nearest_view
             nearest_frame = views[nearest].row
-            bad_frames.append(BadFrames(frames, difference, like / LIKER, (
+            bad_frames.append(BadFrames(frames, difference, difference_from_view / LIKER, (
                 f"the sample was in the beam. In line integral, these flats differ by {difference:.3g} from the "
-                f"{compared_with}, but only by {like:.2g} from the projection in frame {nearest_frame}."
+                f"{compared_with}, but only by {difference_from_view:.2g} from the projection in frame {nearest_frame}."
             )))  # fmt: skip
     # otherwise the beam drifts, and each flat is similar to the projections next to it
     if len(bad_frames) < len(compared):
@@ -204,8 +204,8 @@ def views_show_nothing(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
         yield BadFrames((), max(largest), max(limits), (
             "The projections show no sample: the projections that were checked differ from the flats only by noise "
             f"(all line integrals are below {max(largest):.2g}). Check whether the sample was in the field of view. If "
-            "it was, it was also in the beam during the flats and looks the same from all sides: take new flats "
-            "without the sample."
+            "the sample was in the field of view, the sample was also in the beam during the flats, and looks the same "
+            "from all sides: take new flats without the sample."
         ))  # fmt: skip
 
 

@@ -188,8 +188,8 @@ def _valid(answer: Any, name: str, row: int) -> CheckResult[Any]:
         first_row = rows[0]
         last_row = rows[1]
         raise ValueError(
-            f"the check returned a flag for the check {flag.check!r} and rows {first_row} to {last_row}; expected "
-            f"the check {name!r} and rows up to {row}"
+            f"the check returned a flag for the check {flag.check!r} and frames {first_row} to {last_row}; expected a "
+            f"flag for the check {name!r} and frames up to {row}"
         )
     return answer
 

@@ -225,8 +225,8 @@ def remarks(facts: PlanFacts) -> Iterator[str]:
     if plan.n_views < criterion:
         n_cols = camera.shape[1]
         yield (
-            f"{plan.n_views} projections are fewer than pi/2 x {n_cols} columns = {criterion}: filtered "
-            "back-projection will show streaks towards the edge"
+            f"filtered back-projection will show streaks towards the edge, because the scan has {plan.n_views} "
+            f"projections; expected at least {criterion} (pi/2 x {n_cols} columns)"
         )
     if plan.retakes:
         yield (
@@ -336,8 +336,8 @@ def _rounding(facts: PlanFacts) -> Iterator[str]:
     )
 
 
-def _reference(name: str, field: FieldPlan, exposure: float, otherwise: str) -> Iterator[str]:
+def _reference(name: str, field: FieldPlan, exposure: float, consequence: str) -> Iterator[str]:
     if field.at is Place.NONE:
         yield f"no {name} will be taken (scan.{name}.at: none)"
     elif field.exposure != exposure:
-        yield f"{name} are exposed for {field.exposure:g} s and projections for {exposure:g} s; {otherwise}"
+        yield f"{name} are exposed for {field.exposure:g} s and projections for {exposure:g} s; {consequence}"

@@ -274,7 +274,6 @@ def _not_found(source: ScanSource, error: Exception) -> DataError:
 
 def _unclear(axis_col: float) -> str:
     return (
-        f"Check the slices for double edges, because the rotation axis found, column {axis_col:.2f}, is "
-        "not a clear optimum. `beamline sweep FILE axis=A:B:STEP` compares columns, and --axis COLUMN "
-        "sets one."
+        f"Check the slices for double edges, because the rotation axis found, column {axis_col:.2f}, is not a clear "
+        "optimum. `beamline sweep FILE axis=A:B:STEP` compares columns, and --axis COLUMN sets the column."
     )

@@ -302,16 +302,16 @@ def _total_absorption(
     tolerance = max(_ABSORPTION_RANGE, 2 * _NOISE * noise)
     limit = max(_ABSORPTION_OUTLIER, _OUTLIERS * median_deviation(moments.mass))
     outliers = np.abs(moments.mass) > limit
-    because = "a sample inside the field of view has the same total absorption in all projections"
+    rule = "a sample inside the field of view has the same total absorption in all projections"
     if outliers.any() and (high - low <= tolerance or outliers.mean() < _FEW):
         largest = moments.mass[outliers][np.abs(moments.mass[outliers]).argmax()]
         how_many = count(int(outliers.sum()), "projection")
         odd_frames = frames_text(frames[outliers])
         differ = "differs" if outliers.sum() == 1 else "differ"
         sentence = (
-            f"Look at these frames: {how_many} of {outliers.size} checked ({odd_frames}) {differ} from the others by "
-            f"up to {largest:+.1%} in total absorption, but {because}. Something other than the sample was in the "
-            "beam, or the intensity is wrong. Use --views to leave these projections out."
+            f"Look at these frames: {how_many} of {outliers.size} checked ({odd_frames}) {differ} from the other "
+            f"projections by up to {largest:+.1%} in total absorption, but {rule}. Something other than the sample was "
+            "in the beam, or the intensity is wrong. Use --views to leave these projections out."
         )
         return ConsistencyCondition(
             "mass of the views", float(abs(largest)), limit, "of the total absorption", sentence
@@ -320,9 +320,9 @@ def _total_absorption(
     lowest_frame, highest_frame = frames[moments.mass.argmin()], frames[moments.mass.argmax()]
     sentence = (
         f"The total absorption changes by {change:.0%} during the scan (lowest in frame {lowest_frame}, highest in "
-        f"frame {highest_frame}), but {because}. Did the energy or the sample change, or do some projections belong "
-        "to another scan, exposure or flat field? Use --views to choose projections that belong together (every:2 "
-        "if two intensities alternate), or --volumes if the sample changes."
+        f"frame {highest_frame}), but {rule}. Did the energy or the sample change, or do some projections belong to "
+        "another scan, exposure or flat field? Use --views to choose projections that belong together (every:2 if two "
+        "intensities alternate), or --volumes if the sample changes."
     )
     return ConsistencyCondition("mass of the views", float(high - low), tolerance, "of the total absorption", sentence)
 
@@ -388,7 +388,7 @@ def _centre_of_mass(moments: ViewMoments) -> ConsistencyCondition:
     sentence = (
         "The sample or the stage moved sideways, or frames have wrong angles: the centre of mass deviates by "
         f"{deviation:.1f} columns (uncertainty {moments.col_shift_sigma:.2g}) from the sine curve of a rotating "
-        "sample. Use --calibrate shifts or --poses to correct it, or --volumes if the sample changes."
+        "sample. Use --calibrate shifts or --poses to correct the shifts, or --volumes if the sample changes."
     )
     tolerance = max(_LEAST_COL_SHIFT, 2 * _NOISE * moments.col_shift_sigma)
     return ConsistencyCondition("centre of mass on a sine", float(deviation), tolerance, "columns", sentence)

@@ -105,11 +105,11 @@ def damaged_frames(scan: SelectedScan, frames: NDArray[np.int64]) -> tuple[NDArr
     damaged = np.isin(frames, sorted(source.damaged)) & ~unreadable
     used = scan.selection.step(Preparation).uses_flags
     if damaged.any():
-        taken = "left out" if used else "used anyway (--flags ignore)"
         which = frames_text(np.sort(frames[damaged]))
-        differ = "differs" if damaged.sum() == 1 else "differ"
+        differ, are = ("differs", "is") if damaged.sum() == 1 else ("differ", "are")
+        are_taken = f"{are} left out" if used else f"{are} used anyway (--flags ignore)"
         sentences.append(
-            f"Look for an intact copy of {source.path}: {which} {differ} from the stored checksum, {taken}."
+            f"Look for an intact copy of {source.path}: {which} {differ} from the stored checksum and {are_taken}."
         )
     return unreadable | damaged if used else unreadable, sentences
 
@@ -265,11 +265,11 @@ def no_beam_sentence(scan: ScanEvidence, requested: NDArray[np.int64], exposed: 
     if not without_beam.size:
         return ""
     gap = f", which leaves {gap_text}" if (gap_text := new_gap(scan, requested, exposed)) else ""
-    they_are = "It is" if without_beam.size == 1 else "They are"
+    these_are = "This projection is" if without_beam.size == 1 else "These projections are"
     return (
         f"{count(without_beam.size, 'projection')} of {scan.source.table.views.size} ({frames_text(without_beam)}) had "
         "no beam: the shutter was closed, the beam was lost, or these frames were never written to the file. "
-        f"{they_are} left out{gap}."
+        f"{these_are} left out{gap}."
     )
 
 

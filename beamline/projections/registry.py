@@ -53,7 +53,10 @@ def registered() -> tuple[type[PrepStep], ...]:
                 "have options of the same names"
             )
         if not by_name.keys() >= set(step.follows):
-            raise ValueError(f"the step follows {sorted(step.follows)}, but the steps are {sorted(by_name)}")
+            raise ValueError(
+                "the attribute `follows` of the step names unknown steps: "
+                f"{sorted(set(step.follows) - by_name.keys())}; known steps are {sorted(by_name)}"
+            )
         taken.update(names_of_options)
         return step
 

@@ -87,10 +87,11 @@ def cut_sentence(sides: dict[str, float], continued: bool, wide: bool) -> str:
         continued: True if FBP extrapolates the projections.
         wide: True if the scan has laterally offset projections.
     """
-    fbp = (
-        "FBP extrapolates the projections beyond the detector, and densities are off by tens of per cent. The other"
+    full_width = (
+        "FBP extrapolates the projections beyond the detector, and densities are off by tens of per cent. The other "
+        "methods reconstruct the full width of the sample."
         if continued
-        else "Iterative"
+        else "Iterative methods reconstruct the full width of the sample."
     )
     advice = (
         "To measure the rest of the sample, take offset projections (scan.offset_views, 8 to 16 more "
@@ -98,22 +99,22 @@ def cut_sentence(sides: dict[str, float], continued: bool, wide: bool) -> str:
         "acquisition, twice the projections). "
     )
     return (
-        f"{beyond_the_field(sides)} {fbp} methods reconstruct the full width of the sample. "
-        f"{'' if wide else advice}The edge columns are therefore not used as air reference. If the edge columns do "
-        "show air, and only the beam is weaker than in the flats, use --air columns."
+        f"{beyond_the_field(sides)} {full_width} {'' if wide else advice}The edge columns show the sample, so they are "
+        "not used as air reference. If the edge columns do show air, and only the beam is weaker than in the flats, "
+        "use --air columns."
     )
 
 
 def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str:
     """The warning for a sample that is inside the field of view only in some projections, see `FieldEdges.passing`."""
-    words = " and ".join(
+    where = " and ".join(
         f"at the {side} edge in projections {first} to {last}" for side, (first, last) in ranges.items()
     )
     return (
-        "Centre the sample on the rotation axis, or move the camera until the axis is near an edge of the detector "
-        f"and take a 360° scan: the sample leaves the field of view {words} of {n_views} and is inside the field of "
-        "view in the other projections. The sample, or a part of it, is off the rotation axis. Material farther "
-        "from the axis than the edge of the detector is not reconstructed, and the rim of the volume is uncertain."
+        "Centre the sample on the rotation axis, or move the camera until the axis is near an edge of the detector and "
+        f"take a 360° scan: the sample leaves the field of view {where} of {n_views} and is inside the field of view "
+        "in the other projections. The sample, or a part of it, is off the rotation axis. Material farther from the "
+        "axis than the edge of the detector is not reconstructed, and the rim of the volume is uncertain."
     )
 
 

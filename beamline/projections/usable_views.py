@@ -143,8 +143,8 @@ def usable_views(scan: ScanEvidence, use_flags: bool) -> UsableViews:
         alarmed, warned = views & flags.alarmed, views & flags.flagged & ~flags.alarmed
         with_alarm = count(int(alarmed.sum()), "projection")
         n_warned = warned.sum()
-        n = f"{with_alarm} with an alarm and {n_warned} with a warning"
-        sentence = f"--flags ignore: {n} are used as they are."
+        with_flags = f"{with_alarm} with an alarm and {n_warned} with a warning"
+        sentence = f"--flags ignore: {with_flags} are used as they are."
         return UsableViews(scan, rows, sentence=sentence, flags=flags)
     policy = flag_policy(flags, views, scan.source.shape)
     if not policy.in_words:

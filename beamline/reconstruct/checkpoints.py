@@ -169,12 +169,12 @@ def _read_state(path: Path) -> tuple[Checkpoint, FitState]:
     return saved, reached
 
 
-def refuse_other(path: Path, now: Mapping[str, Value], before: Mapping[str, Value], made_by: str) -> None:
-    """Raise DataError with the differences if a file has another origin; `made_by` names the content of the file."""
+def refuse_other(path: Path, now: Mapping[str, Value], before: Mapping[str, Value], content: str) -> None:
+    """Raise DataError with the differences if a file has another origin; `content` names the content of the file."""
     others = differences(now, before)
     if others:
         listed = "; ".join(others[:6]) + (f"; and {len(others) - 6} more" if len(others) > 6 else "")
         raise DataError(
-            f"{path} belongs to another {made_by}, so it cannot be resumed: {listed}. Use the options with which "
+            f"{path} belongs to another {content}, so it cannot be resumed: {listed}. Use the options with which "
             f"{path} was written, or start again without --resume. No file was changed."
         )

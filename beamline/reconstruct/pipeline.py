@@ -134,7 +134,7 @@ def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: Follow
             if should_stop():
                 raise KeyboardInterrupt("stopped before the scan had ended; nothing was written")
         if drawn is not None:
-            message = "The picture shows all projections of the scan"
+            message = "The picture now shows slices from all projections of the scan"
             channels.sink(StateEntered(ALL_SHOWN, message, time=channels.clock.now()))
     return replace(options, follow=None)
 

@@ -103,8 +103,8 @@ def _footnotes(
 ) -> list[str]:
     """The meaning of the figures of merit that this report shows."""
     of_several = (
-        "difference between each projection and the forward projection of the volume at its time, relative to the "
-        "projection. The value also falls if the projections have less noise."
+        "difference between each projection and the forward projection of the volume at the time of this projection, "
+        "relative to the projection. The value also falls if the projections have less noise."
     )
     of_one = "|A x − p| / |p| over up to 16 projections p; x is the volume, A the forward projection (Joseph 1982)."
     slices = 0 if unexplained is None else len(unexplained.significance)
@@ -173,7 +173,8 @@ def _further(
         yield Picture(
             "Darks and flats",
             "Frames as the camera recorded them. Smooth flats are better: dust makes rings if it moves, or if it is "
-            "only in the flats. If there are two groups of flats, their ratio should be near one everywhere.",
+            "only in the flats. If there are two groups of flats, the ratio of the two groups should be near 1 "
+            "everywhere.",
             reference_sheet(facts.references, facts.shape),
         )
     if facts.flagged:
@@ -201,8 +202,8 @@ def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mappin
     yield Picture(
         "Sharpest edge, and values",
         "Values along a line through the sharpest edge: the steeper the edge, the sharper the volume; dips and "
-        "overshoots next to the edge are artefacts. Histogram: narrower peaks are better, unless the sample has "
-        "values between them.",
+        "overshoots next to the edge are artefacts. Histogram: narrower peaks are better, unless the sample has values "
+        "between the peaks.",
         pictures.profile_and_values(shown, unit, kind),
     )
     if len(shown) > 1:
@@ -310,7 +311,7 @@ def _views(prepared: PreparedProjections) -> Iterator[Picture]:
     yield Picture(
         "Sinogram",
         "The middle detector row of all projections used. Vertical stripes become rings in the volume. If a curve is "
-        "interrupted, a projection does not fit the others.",
+        "interrupted, one of the projections does not fit the other projections.",
         pictures.sinogram(data, geometry, geometry.detector_shape[0] // 2),
     )
     if axis is not None:

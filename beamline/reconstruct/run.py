@@ -148,8 +148,8 @@ def refuse_impossible(options: ReconOptions) -> None:
     if options.target.written and options.target.output.suffix.lower() not in SUFFIXES:
         raise ConfigError(
             "--uncertainty writes two volumes into one file, which needs HDF5: use -o "
-            f"{options.target.output.with_suffix('.h5')}. You can then export each of the two with `beamline export "
-            "--dataset`."
+            f"{options.target.output.with_suffix('.h5')}. You can then export each of the two volumes with `beamline "
+            "export --dataset`."
         )
 
 

@@ -213,7 +213,10 @@ def _add(partial: PartialVolume, n: int, result: Reconstruction | None, remark: 
 
 
 def _with_another_method(slab: Slab, method: str, why: str) -> str:
-    return f"Slices {slab.own.start} to {slab.own.stop - 1} were reconstructed with {method} instead: {why}"
+    return (
+        f"Slices {slab.own.start} to {slab.own.stop - 1} were reconstructed with {method}, not with the method of "
+        f"the first slab: {why}"
+    )
 
 
 @contextmanager

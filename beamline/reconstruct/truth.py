@@ -67,7 +67,11 @@ def fit_truth(truth: NDArray[np.float32], grid: Grid, binning: int) -> Volume:
     if truth.shape != shape:
         if tuple(t // binning for t in truth.shape) != shape:
             coarser = [n for n in range(2, max(shape) + 1) if tuple(s // n for s in shape) == truth.shape]
-            advice = f"Give --bin {coarser[0] * binning}" if coarser else "Choose its slices with FILE:first:end"
+            advice = (
+                f"Give --bin {coarser[0] * binning}"
+                if coarser
+                else "Choose slices of the ground truth with FILE:first:end"
+            )
             raise ConfigError(
                 f"--truth has the shape {truth.shape}, but the volume has {shape} [z, y, x] with --bin {binning}. "
                 f"{advice}."

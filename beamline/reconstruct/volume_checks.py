@@ -171,9 +171,9 @@ def _structure(result: Reconstruction, judgement: Judgement) -> str:
         return ""
     others = " and ".join(name for name in _COMPARED if name != result.method)
     return (
-        f"The {label_of(result.method)} volume may hide cracks, pores or edges: {share:.1%} of the sample voxels leave "
-        f"structure above the noise in the residual (normally at most {UNEXPLAINED_LIMIT:.1%}). Look at 'Residual in "
-        f"the projections' in the report, and compare with --method {others}."
+        f"The {label_of(result.method)} volume may hide cracks, pores or edges: in {share:.1%} of the sample voxels "
+        f"the residual shows structure above the noise (normally in at most {UNEXPLAINED_LIMIT:.1%}). Look at "
+        f"'Residual in the projections' in the report, and compare with --method {others}."
     )
 
 
@@ -283,8 +283,8 @@ def _unused_levels(result: Reconstruction) -> str:
         return ""
     stated = ", ".join(f"{level:g}" for level in np.ravel(levels))
     return (
-        f"The levels {stated} were not used, because held-out projections are not predicted better with them, or "
-        "because a weaker pull to the levels predicts the projections still better (the density then varies within "
-        "a material). The volume is the FISTA-TV volume. Levels are densities in the unit of the volume; do not "
-        "list the density of air. Leave out --levels to have the levels determined from the scan."
+        f"The levels {stated} were not used, because these levels do not improve the prediction of held-out "
+        "projections, or because a weaker pull to the levels predicts the projections still better (the density then "
+        "varies within a material). The volume is the FISTA-TV volume. Levels are densities in the unit of the volume; "
+        "do not list the density of air. Leave out --levels to have the levels determined from the scan."
     )

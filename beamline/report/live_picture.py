@@ -136,13 +136,16 @@ def reference_row(shown: Preview, n_views: int, unit: str) -> PictureRow:
     (moved, volume, change), zoom = _sized((moved, volume, change))
     grey = f"{window[0]:.3g} to {window[1]:.3g} 1/{unit}"
     heading = (
-        f"The reference, moved to where the sample is now, and FBP of what it does not explain in {n_views} "
-        f"projections ({shown.left:.1%} of the norm of the projections; the smaller, the better the reference fits)"
+        "The reference, moved to the present position of the sample, and FBP of the residual, that is, of what the "
+        f"moved reference does not explain in {n_views} projections ({shown.left:.1%} of the norm of the projections; "
+        "the smaller, the better the reference fits)"
     )
     panels = [
         _Panel(moved, window, "the moved reference, x → y ↓", grey, (grid.voxel_size / zoom, unit)),
-        _Panel(volume, window, "the reference plus FBP of the rest", "the same greys and scale"),
-        _Panel(change, (-reach, reach), "FBP of the rest: what changed", f"black {-reach:.2g} to white {reach:.2g}"),
+        _Panel(volume, window, "the reference plus FBP of the residual", "the same greys and scale"),
+        _Panel(
+            change, (-reach, reach), "FBP of the residual: what changed", f"black {-reach:.2g} to white {reach:.2g}"
+        ),
     ]
     return PictureRow(heading, panels)
 

@@ -70,8 +70,9 @@ def better_order(plan: ScanPlan) -> tuple[str, ...]:
         return ()
     return (
         "with angles in sequence the live volume is a limited-angle reconstruction until the last projection. In a "
-        f"test scan of particles its PSNR was {_SEQUENTIAL} dB after a quarter, half and three quarters of the scan. "
-        f"With scan.angles {better_angles} the PSNR was {expected} dB; the final volume is the same",
+        f"test scan of particles the PSNR of the live volume was {_SEQUENTIAL} dB after a quarter, half and three "
+        f"quarters of the scan. With scan.angles {better_angles} the PSNR was {expected} dB; the final volume is the "
+        "same",
     )
 
 
@@ -95,9 +96,9 @@ def live_need(shape: tuple[int, int], n_views: int, free: int) -> str:
     reductions = [f"one projection in {plan.one_in}"] if plan.one_in > 1 else []
     reductions += [f"pixels binned {plan.binning} x {plan.binning}"] if plan.binning > 1 else []
     whole = f"all {n_views} projections of {shape[0]} x {shape[1]} would need {size(live_bytes(shape, n_views))}"
-    wide = f"at most {_WIDEST} columns and " if shape[1] > _WIDEST else ""
+    columns_text = f"at most {_WIDEST} columns and " if shape[1] > _WIDEST else ""
     what_to_change = ", ".join(reductions)
     return (
-        f"{need} ({what_to_change}). The reason: the live volume may use {wide}{share_text}, but {whole}. `beamline "
-        "recon` makes the full volume"
+        f"{need} ({what_to_change}). The reason: the live volume may use {columns_text}{share_text}, but {whole}. "
+        "`beamline recon` makes the full volume"
     )

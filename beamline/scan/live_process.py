@@ -303,8 +303,8 @@ class LiveReconstruction:
             else:
                 self.ended = True
                 then = (
-                    "The scan continues without a live reconstruction. To start another one: beamline recon "
-                    "FILE --follow -o OUT.h5"
+                    "The scan continues without a live reconstruction. To start another live reconstruction: beamline "
+                    "recon FILE --follow -o OUT.h5"
                 )
             message = f"The live reconstruction ended {when} (code {process.code}). See {self._log.name}. {then}"
             self._sink(Warned(message, source="recon"))

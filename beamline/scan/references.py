@@ -78,7 +78,8 @@ class ReferenceLog:
                 reported as missing.
         """
         missing = {
-            block.kind.name: f"The {block.n} {block.kind.name.lower()}s planned before the projections were not taken."
+            block.kind.name: f"The scan did not take the {block.n} {block.kind.name.lower()}s that its plan has before "
+            "the projections."
             for block in planned
             if block.kind in REFERENCES and not self.evidence.of_kind(block.kind)
         }

@@ -240,7 +240,7 @@ def _files(run: Path) -> tuple[list[Path], list[str]]:
     files = files_with_frames(run)
     empty = [part / SCAN for part in parts_of(run) if (part / SCAN).is_file() and part / SCAN not in files]
     return files, [
-        f"{scan} is left out, because none of its frames can be read and its {EVENTS} lists none." for scan in empty
+        f"{scan} is left out, because none of its frames can be read and its {EVENTS} lists no frame." for scan in empty
     ]
 
 

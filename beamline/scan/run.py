@@ -172,8 +172,8 @@ def _announced_sink(
     announcers = [Announcer(each, clock) for each in ([record], [*logs, *sinks])]
     sink = fan_out(*map(stack.enter_context, announcers))
     for device, description in ready.info.devices.items():
-        if settings := description.get(FOUND):
-            sink(Warned(f"{device}: the settings in the device before this program opened it: {settings}."))
+        if found_state := description.get(FOUND):
+            sink(Warned(f"{device}: this program found the device in this state: {found_state}."))
     return sink
 
 

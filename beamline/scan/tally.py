@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from beamline.core.text import spans
+from beamline.core.text import count, spans
 from beamline.plan.plan import Block
 from beamline.scan.ledger import Ledger
 from drivers.base.frame import FrameKind
@@ -18,9 +18,9 @@ NAMED = 5  # largest number of projections that a sentence names
 DOUBTFUL = 0.2  # steps; a larger possible error of an angle is reported
 TRIES = 3  # number of exposures with the stage at a wrong angle, after which the projection counts as missing
 OFF_TARGET_ADVICE = (
-    "A frame exposed at a wrong angle is kept as an invalid row, and its projection is taken again, up to "
-    f"{TRIES} times in total. Possible causes are another program or person that moves the stage, its manual "
-    "knob, a servo that oscillates, or a controller that reports the end of a move too early"
+    f"A frame exposed at a wrong angle is kept as an invalid row, and its projection is taken again, up to {TRIES} "
+    "times in total. Possible causes are another program or person that moves the stage, the manual knob of the stage, "
+    "a servo that oscillates, or a controller that reports the end of a move too early"
 )
 
 ExposedFrame = tuple[CameraFrame, int, float, bool]
@@ -120,12 +120,13 @@ def _block_discrepancies(tally: BlockTally) -> str:
     if tally.missing and not tally.is_retake:
         n = len(tally.missing)
         angles = np.degrees(block.angles[tally.missing])
-        angles_text = "" if np.isnan(angles).any() else f" (from {angles[0]:.4g}° to {angles[-1]:.4g}°)"
+        angles_text = f" (from {angles[0]:.4g}° to {angles[-1]:.4g}°)" if n > 1 else f" (at {angles[0]:.4g}°)"
+        angles_text = "" if np.isnan(angles).any() else angles_text
         text = f"{n} of {block.n} {noun}s {'is' if n == 1 else 'are'} missing: {spans(tally.missing)}{angles_text}."
         if tally.lost:
             text += (
-                f" {tally.lost} were exposed but never delivered by the camera: `beamline check --connect` tests the "
-                "link of the camera."
+                f" Exposed, but never delivered by the camera: {count(tally.lost, 'frame')}. `beamline check "
+                "--connect` tests the link of the camera."
             )
         if astray := sum(trigger in tally.off_target for trigger in tally.missing):
             text += (
@@ -133,25 +134,25 @@ def _block_discrepancies(tally: BlockTally) -> str:
                 "exposures (invalid rows)."
             )
         if tally.ignored:
-            text += f" {tally.ignored} triggers gave no frame, because the camera was not ready and ignored them."
+            text += f" {count(tally.ignored, 'trigger')} gave no frame, because the camera was not ready at that time."
     if untriggered := tally.extra - tally.unconfirmed:
-        text += f" {untriggered} frames came without a trigger and are kept as invalid rows."
+        text += f" {count(untriggered, 'frame')} came without a trigger. Such frames are kept as invalid rows."
     if tally.unconfirmed:
         text += (
-            f" {tally.unconfirmed} frames came while the stage braked, and are kept as invalid rows. The angles of "
-            "these frames are not certain: neither the trigger times nor the final position of the stage confirm "
-            "the angles. Either the trigger line picks up noise, or the stage decelerates differently from its "
-            "configured value."
+            f" {count(tally.unconfirmed, 'frame')} came while the stage braked. Such frames are kept as invalid rows, "
+            "because their angles are not certain: neither the trigger times nor the final position of the stage "
+            "confirms the angles. Either the trigger line picks up noise, or the deceleration of the stage differs "
+            "from its configured value."
         )
     if tally.possible_shift:
         text += (
-            f" All angles of a pass may be wrong by up to {tally.possible_shift} steps: the pass has missing or extra "
-            "frames, and it is not known whether these frames are at the start or at the end of the pass."
+            f" All angles of a pass may be wrong by up to {count(tally.possible_shift, 'step')}: the pass has missing "
+            "or extra frames, and it is not known whether these frames are at the start or at the end of the pass."
         )
     if text and tally.largest_residual > DOUBTFUL:
         text += (
-            f" A frame arrived {tally.largest_residual:.2f} periods away from its trigger, so its angle may be wrong "
-            "by the same fraction of an angular step (the warnings of the check `timing` list the frames that came "
-            "early or late)."
+            f" A frame arrived {tally.largest_residual:.2f} periods away from its trigger, so the angle of this frame "
+            "may be wrong by the same fraction of an angular step (the warnings of the check `timing` list the frames "
+            "that came early or late)."
         )
     return text.strip()

@@ -214,8 +214,8 @@ def refuse_broken(group: h5py.Group, path: str) -> None:
     """Raise DataError if a path ends at a broken link."""
     if broken := broken_link(group, path):
         raise DataError(
-            f"{group.file.filename}: {broken}. The link points to another file: put that file back into the folder of "
-            "this one."
+            f"{group.file.filename}: {broken}. The link points to another file: put that other file back into the "
+            f"folder of {group.file.filename}."
         )
 
 
@@ -360,8 +360,9 @@ def missing_links(item: h5py.Dataset, whole: dict[tuple[str, str], bool] | None 
         first_packed = packed[0]
         raise DataError(
             f"{item.name} in {item.file.filename} is a virtual dataset. The values behind it, {first_packed}, are "
-            "packed (attributes scale_factor, ...), and a virtual dataset returns them without unpacking. In a copy "
-            "of the file, give the virtual dataset the same attributes, or store unpacked values. Nothing was read."
+            "packed (attributes scale_factor, ...), and a virtual dataset returns packed values without unpacking "
+            "them. In a copy of the file, give the virtual dataset the same attributes, or store unpacked values. "
+            "Nothing was read."
         )
     return sorted(lost)
 
@@ -398,17 +399,17 @@ def require_possible(item: Any) -> int:
     if item.shape[0] > _FRAMES or item.shape[1] * item.shape[2] > _PIXELS:
         item_shape = " x ".join(map(str, item.shape))
         raise DataError(
-            f"{item.name} in {item.file.filename} is {item_shape}; expected at most {_FRAMES} frames of {_PIXELS} "
-            "pixels."
+            f"{item.name} in {item.file.filename} has {item_shape} values; expected at most {_FRAMES} frames of "
+            f"{_PIXELS} pixels."
         )
     stored = getattr(item, "item", item)  # chunks of a Zarr are usually compressed
     packed = stored.id.get_create_plist().get_nfilters() if isinstance(stored, h5py.Dataset) else bool(stored.chunks)
     if (needed := _UNPACKING * piece_of(item) if packed else 0) > HELD and needed > (free := free_memory()):
         chunk_size = size(piece_of(item))
         raise DataError(
-            f"{item.name} in {item.file.filename} is stored in chunks of {chunk_size}: unpacking one needs "
-            f"{size(needed)} of memory, and {size(free)} are free. On a computer with more memory, copy the file "
-            "with one frame per chunk (h5repack -l CHUNK=...). Nothing was read."
+            f"{item.name} in {item.file.filename} is stored in chunks of {chunk_size}: unpacking one chunk needs "
+            f"{size(needed)} of memory, and {size(free)} are free. On a computer with more memory, copy the file with "
+            "one frame per chunk (h5repack -l CHUNK=...). Nothing was read."
         )
     return needed
 

@@ -247,7 +247,9 @@ def write_legend(file: h5py.File) -> None:
     file[REGIONS].attrs["description"] = "first row, row after the last, first column, column after the last; -1: none"
     file[REGIONS].attrs["units"] = "pixel"
     file[VALID].attrs["description"] = "0: a check raised an alarm. The pixels are stored as the camera delivered them"
-    group["bit"].attrs["description"] = "set in flags if the check flagged the frame; alarm_bit: if it raised an alarm"
+    group["bit"].attrs["description"] = (
+        "this bit is set in flags if the check flagged the frame; alarm_bit is set if the check raised an alarm"
+    )
     group["unit"].attrs["description"] = "of the check's score"
 
 

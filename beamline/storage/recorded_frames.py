@@ -137,7 +137,9 @@ def _column(file: h5py.File, path: str, n: int) -> NDArray[Any]:
         hdf5.look_again(column)
     values = np.asarray(column[:n])
     if values.shape != (n,) or column.dtype != dtype:
-        raise ValueError(f"{path} is {column.dtype} {column.shape}, expected {dtype} of {n} rows")
+        raise ValueError(
+            f"{path} has the type {column.dtype} and the shape {column.shape}; expected {dtype} with {n} rows"
+        )
     return values
 
 

@@ -174,8 +174,8 @@ def _copied(path: Path, head: Superblock, target: Path) -> Recovered:
                     ending = ScanEnding("failed", gaps_in(path, copy), DIED)
                 if lost:
                     reason = (
-                        f"{ending.reason} Frames that are lost, because the scan had written them but they did not "
-                        f"reach the disk: {frames_text(lost)}."
+                        f"{ending.reason} Lost frames, which the scan wrote but which did not reach the disk: "
+                        f"{frames_text(lost)}."
                     )
                     ending = replace(ending, status="failed", reason=reason.strip())
                 state_ending(copy, ending)

@@ -184,8 +184,8 @@ def _from_folder(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, f
             slices = np.empty((len(files), *values.shape), values.dtype)
         if values.ndim != 2 or (values.shape, values.dtype) != (slices.shape[1:], slices.dtype):
             raise DataError(
-                f"{path / name} is {values.dtype} {values.shape}; expected slices [y, x] of one type and shape, "
-                f"{slices.dtype} {slices.shape[1:]}."
+                f"{path / name} has the type {values.dtype} and the shape {values.shape}; expected slices [y, x] of "
+                f"the type {slices.dtype} and the shape {slices.shape[1:]}."
             )
         slices[z] = values
     assert slices is not None

@@ -62,8 +62,8 @@ def of_port(url: str, problem: BaseException) -> str:
         ),
         (
             number in (errno.EACCES, errno.EPERM),
-            "This account has no permission to use the port: ask the administrator for a udev rule that gives "
-            "it to one of your groups (GROUP, MODE)",
+            "This account has no permission to use the port: ask the administrator for a udev rule that gives the port "
+            "to one of your groups (GROUP, MODE)",
         ),
         (
             number in (errno.EBUSY, errno.EAGAIN) or "PermissionError(13" in str(problem),  # on Windows

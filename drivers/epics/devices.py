@@ -220,7 +220,11 @@ class MonochromatorPvs(CheckedSettings):
     )
     unit: EnergyUnit = setting(EnergyUnit.KEV, "Unit of pv and status_pv.")
     tolerance: float = setting(
-        0.5, "Largest allowed difference in eV between the energy and the requested energy.", unit="ev", gt=0, le=1e4
+        0.5,
+        "Largest allowed difference in eV between the measured energy and the requested energy.",
+        unit="ev",
+        gt=0,
+        le=1e4,
     )
     settle: float = setting(
         1.0,

@@ -268,7 +268,7 @@ class SerialLine:
                 expected="one reply",
                 advice="Two controllers on this line have the same address: give each controller its own address, or "
                 "unplug one",
-                state=f"{state}. Both carried out earlier requests",
+                state=f"{state}. Both controllers carried out earlier requests",
             )
 
     def _wait_for_quiet(self, request: str, state: str) -> None:

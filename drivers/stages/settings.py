@@ -46,9 +46,11 @@ class StageFigures(CheckedSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for meaning, rate in (("speed", self.max_speed), ("acceleration", self.acceleration)):
+        for meaning, rate, unit in (("speed", self.max_speed, "deg/s"), ("acceleration", self.acceleration, "deg/s²")):
             if not rate * self.per_radian < MOST:
-                raise ValueError(f"check the settings of the stage: {rate:g} rad is impossible as its {meaning}")
+                raise ValueError(
+                    f"check the settings of the stage: its {meaning} cannot be {math.degrees(rate):g} {unit}"
+                )
         if not -FARTHEST <= self.low < self.high <= FARTHEST:
             low, high = math.degrees(self.low), math.degrees(self.high)
             raise ValueError(

@@ -129,8 +129,8 @@ class Travel:
             expected=f"one or more pulses, at least {self.limits.pulse_spacing:g} s apart at full speed, which is "
             f"{least} counts,{multiple} all within {self.span}",
             advice=advice,
-            state="Nothing was sent to the stage, and it will send no trigger pulses; the stage is where the last "
-            "move ended",
+            state="Nothing was sent to the stage. The stage is where the last move ended, and will send no trigger "
+            "pulses",
         )
 
     def refuse_late_arming(self, train: TriggerTrain, counts: int, opening: Fraction | int | None = None) -> None:

@@ -194,8 +194,8 @@ def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> 
     for name, value in values.items():
         if without_mask(value) is not value:
             raise ValueError(
-                f"{name} has masked values, and this function cannot leave them out. Remove the projections with "
-                "masked values, or fill the masked values first"
+                f"{name} has masked values, which this function cannot leave out. Remove the projections with masked "
+                "values, or fill the masked values first"
             )
         if name in declared and not is_of_type(value, declared[name]):
             raise ValueError(refusal(name, value, declared[name]))

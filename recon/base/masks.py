@@ -25,7 +25,10 @@ def plan_fill(mask: Mask) -> Fill:
         ValueError: all pixels [row, col] are masked.
     """
     if mask.all():
-        raise ValueError(f"all {mask.size} pixels are masked or not finite, so there are no values to fill them from")
+        raise ValueError(
+            f"all {mask.size} pixels are masked or not finite, so there are no values from which these "
+            "pixels could be filled"
+        )
     ring = scipy.ndimage.distance_transform_cdt(mask, "chessboard")
     r, c = np.nonzero(mask)
     order = np.argsort(ring[r, c], kind="stable")

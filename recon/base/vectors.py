@@ -137,8 +137,8 @@ def _frame(u: F64, v: F64) -> tuple[F64, F64, F64]:
     if flat.any():
         view = int(np.flatnonzero(flat)[0])
         raise ValueError(
-            f"projection {view}: u and v must be different directions across the beam. One is zero, they are "
-            f"parallel, or one is along the beam: {u[view]} and {v[view]}"
+            f"projection {view}: u and v must be different directions across the beam. One of u and v is zero or lies "
+            f"along the beam, or u and v are parallel: {u[view]} and {v[view]}"
         )
     along_cols, along_rows = (left @ right).transpose(2, 0, 1)
     return along_cols, along_rows, np.cross(along_rows, along_cols)

@@ -141,5 +141,7 @@ def used_views(n_views: int, held_out: Sequence[int]) -> NDArray[np.bool_]:
     if kept_back.size and not (kept_back[0] >= 0 and kept_back[-1] < n_views):
         raise ValueError(f"held_out must be projection numbers 0 to {n_views - 1}, got {kept_back[[0, -1]].tolist()}")
     if kept_back.size >= n_views:
-        raise ValueError(f"all {n_views} projections are held out, so none is left for the fit; hold out fewer")
+        raise ValueError(
+            f"all {n_views} projections are held out, so no projection is left for the fit; hold out fewer projections"
+        )
     return ~np.isin(np.arange(n_views), kept_back)

@@ -148,7 +148,7 @@ def _launch() -> None:
         _launched_by_numba()
         warnings.warn(
             f"Unset NUMBA_THREADING_LAYER: the layer {stated} is not available ({str(error).splitlines()[0]}), so "
-            "another one is used.",
+            "another layer is used.",
             stacklevel=2,
         )
 

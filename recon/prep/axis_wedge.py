@@ -121,7 +121,7 @@ def axis_from_sinogram(sinogram: NDArray[np.floating], angles: Floats) -> AxisEs
     theta = np.asarray(angles, np.float64)
     if sinogram.ndim not in (2, 3) or theta.shape != sinogram.shape[:1]:
         raise ValueError(
-            "the sinogram must be [view, col] or [view, row, col] with one angle for each view, got shapes "
+            "the sinogram must be [view, col] or [view, row, col] with one angle for each projection, got shapes "
             f"{sinogram.shape} and {theta.shape}"
         )
     data = few_rows(sinogram[:, None] if sinogram.ndim == 2 else sinogram)

@@ -178,8 +178,8 @@ def photon_transfer(flats: ArrayLike, darks: ArrayLike | None = None) -> tuple[f
     gain = float(noise[exposed].sum() / signal[exposed].sum()) if exposed.any() else 0.0
     if not gain > 0:
         raise ValueError(
-            "state the gain: it cannot be measured here, because the variance of the flats does not grow with their "
-            f"intensity (gain {gain:.3g} counts per photon)"
+            "the gain cannot be measured here, because the variance of the flats does not grow with their intensity "
+            f"(gain {gain:.3g} counts per photon); state the gain"
         )
     return gain, float(np.median(dark_variance))
 

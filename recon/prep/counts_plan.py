@@ -70,8 +70,8 @@ class CorrectionSettings:
             raise ValueError(f"floor must be a transmission between 0 and 1, got {self.floor}")
         if not (self.hot_threshold > 0 and self.zinger_threshold > 0):
             raise ValueError(
-                f"thresholds must be positive (inf turns one off), got hot {self.hot_threshold}, "
-                f"zinger {self.zinger_threshold}"
+                f"thresholds must be positive (inf switches a threshold off), got hot {self.hot_threshold}, zinger "
+                f"{self.zinger_threshold}"
             )
 
 

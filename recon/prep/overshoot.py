@@ -82,8 +82,8 @@ class Overshoot:
     def in_words(self) -> str:
         return (
             "The projections have phase fringes, or they were sharpened: next to the outer edges of the sample, line "
-            f"integrals are below those of air, by {self.share:.1%} of the step at the edge. Blur and noise do not "
-            "make line integrals fall below those of air."
+            f"integrals are lower than in air, by {self.share:.1%} of the step at the edge. Blur and noise do not make "
+            "line integrals lower than in air."
         )
 
 

@@ -79,8 +79,8 @@ def check(references: References) -> None:
     for position, flat in references.flats:
         if np.shape(flat) != shape or len(shape) != 2:
             raise ValueError(
-                f"the dark has shape {shape}, the flat at {position:g} has {np.shape(flat)}; both must have the same "
-                "shape"
+                f"the dark has shape {shape}, the flat at position {position:g} has shape {np.shape(flat)}; both must "
+                "have the same shape"
             )
     positions = sorted(p for p, _ in references.flats)
     if len(set(positions)) < len(positions) or not np.isfinite(positions).all():

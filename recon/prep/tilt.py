@@ -75,8 +75,8 @@ def find_tilt(bands: NDArray[np.floating], heights: F64, angles: F64) -> TiltEst
         with suppress(ValueError):
             return line_through(*curves_of(data, np.asarray(angles, np.float64)), heights)
     raise ValueError(
-        f"found no tilt: the axes of {len(heights)} bands of rows are not on one line with a tilt of at most "
-        f"{math.degrees(STEEPEST):g} degrees, or the projections are not evenly spread over 180°"
+        f"the axes of {len(heights)} bands of rows are not on one line with a tilt of at most "
+        f"{math.degrees(STEEPEST):g} degrees, or the projections are not evenly spread over 180°, so no tilt was found"
     )
 
 

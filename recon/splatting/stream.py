@@ -147,7 +147,7 @@ class StreamingFit:
         views = self._stage.views if which is None else self._stage.views.only(which)
         if views.n == 0:
             raise ValueError(
-                "add projections before you replace them, and keep at least one: no projections would be left"
+                "the fit would have no projection: add projections first, and keep at least one projection"
             )
         images = checked_views(data, views.angles, views.template.detector_shape)
         self._stage = self._stage.with_images(images, which)

@@ -84,7 +84,7 @@ class _FitViews:
             )
         views = problem.views.masked()
         if method.early_stop and not views.held_out.size:
-            raise ValueError("early_stop needs held-out projections; state some with held_out")
+            raise ValueError("early_stop needs held-out projections; state their numbers in held_out")
         # only ratios of weights matter, because total variation has its own weight
         if (rays := views.weights) is not None:
             views = replace(views, weights=rays / np.float32(usual_weight(rays, views.data)))

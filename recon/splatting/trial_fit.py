@@ -53,7 +53,7 @@ def predict(method: Fit, trial: Trial, so_far: TrialChoice, prior: Prior) -> Pre
         remark = (
             f"{method.name} stopped after {FIRST_SHARE:.0%} of its steps, because its residual was much larger than "
             f"that of total variation (a full test takes about {(trial.settings.now() - begin) / FIRST_SHARE:.2g} s; "
-            "--quality best runs it)"
+            "--quality best runs the full test)"
         )
     elif not leads:
         fit = _Fit.of(method, trial, 1.0)

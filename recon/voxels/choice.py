@@ -263,8 +263,8 @@ class TrialChoice(NamedTuple):
         if simplest >= self.chosen:
             return ""
         return (
-            f". {self._gain(self.chosen, simplest)}. A gain below {self.least_gain:.0%} suffices here, because it "
-            f"exceeds {_CERTAIN_ERRORS:.0f} standard errors and {self.predictions[self.chosen].name} costs little"
+            f". {self._gain(self.chosen, simplest)}. Here a gain below {self.least_gain:.0%} suffices, because the "
+            f"gain exceeds {_CERTAIN_ERRORS:.0f} standard errors and {self.predictions[self.chosen].name} costs little"
         )
 
     def _gain(self, better: int, worse: int) -> str:

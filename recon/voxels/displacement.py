@@ -94,8 +94,8 @@ def displaced(geometry: Geometry, parts: Parts, moves: Sequence[Displacement]) -
     """
     if geometry.is_cone:
         raise ValueError(
-            "displacements can be corrected only in a parallel beam; in a cone beam a displaced sample changes more "
-            "than the position of its image"
+            "displacements can be corrected only in a parallel beam; in a cone beam a displacement of the sample "
+            "changes not only the position of its image"
         )
     x, y, z, rotation, image = np.array([(m.x, m.y, m.z, m.turn, m.image) for m in moves])[parts].T
     c, s = np.cos(geometry.angles), np.sin(geometry.angles)

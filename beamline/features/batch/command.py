@@ -229,7 +229,7 @@ def _read(folder: Path) -> list[BatchRow]:
             reader = csv.DictReader(file)
             rows = [{name: value for name, value in row.items() if name and value} for row in reader]
             if not {"name", "scan"} <= {*(reader.fieldnames or ())}:
-                raise ValueError(f"expected a first line with name and scan, not {reader.fieldnames}")
+                raise ValueError(f"its first line must have the columns name and scan, but has {reader.fieldnames}")
         table = TypeAdapter(list[BatchRow]).validate_python(rows)
         _refuse_names(table)
         return [

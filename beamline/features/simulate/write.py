@@ -175,7 +175,7 @@ def exposure_errors(scene: str) -> Iterator[None]:
     try:
         yield
     except CannotExposeError as error:
-        raise ConfigError(f"{scene} cannot be exposed: {error}.") from error
+        raise ConfigError(f"the simulator cannot compute frames of {scene}: {error}.") from error
 
 
 def steps_of(scene: Scene) -> list[tuple[str, str, str]]:

@@ -77,7 +77,7 @@ class TradeoffRequest:
         "--quick/--full",
         default=True,
         show_default=True,
-        help="Effort: few and short trials (--quick), or many and long ones (--full).",
+        help="Effort. --quick: few and short reconstructions. --full: many and long reconstructions.",
     )
     seconds: float | None = set_by(equal_time)
     seed: int = set_by(heading(METHOD), seed_option)

@@ -187,9 +187,9 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Iterator[tuple[str, Pict
     """The pictures by file name: quality against each cost, and the slices of the baselines or of all rows."""
     if any(math.isfinite(outcome.quality(table.by)) for outcome in table.compared):
         caption = (
-            "Each point is a trial, and each colour is a method. The line shows the best quality at each time. A "
-            f"triangle at the lower edge is a trial more than {_SHOWN_DB:g} dB below the best. Trials without a finite "
-            "quality are not drawn."
+            "Each point is a trial, that is, the reconstruction with one setting. Each colour is a method. The line "
+            f"shows the best quality at each time. A triangle at the lower edge is a trial more than {_SHOWN_DB:g} dB "
+            "below the best. Trials without a finite quality are not drawn."
         )
         yield "quality.png", Picture("Quality against its costs", caption, quality_plot(table))
     if labels := slices.labels():
@@ -208,7 +208,7 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Iterator[tuple[str, Pict
     for method in dict.fromkeys(outcome.trial.method for outcome in table.compared if outcome.trial.choice):
         caption = (
             f"One slice of every volume by {method}, all with the same grey window. If a random selection was "
-            "repeated, the first one is shown."
+            "repeated, the volume of the first selection is shown."
         )
         title = f"{by_name(method).label}, slice by slice"
         yield f"slices_{method}.png", Picture(title, caption, slices.png(slices.labels(method)))

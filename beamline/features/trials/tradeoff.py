@@ -67,8 +67,8 @@ def planned_study(
     if not table.todo:
         last_reason = choices[-1].reason
         raise DataError(
-            f"{scan.source.path}: {n_views} projections are too few for any row of {study.name} (reason for the last "
-            f"one: {last_reason}). Use a scan with more projections."
+            f"{scan.source.path}: {n_views} projections are too few for the study {study.name}, because no row of its "
+            f"table can be computed (reason for the last row: {last_reason}). Use a scan with more projections."
         )
     warn = Warnings(sink, clock)
     for choice in choices:

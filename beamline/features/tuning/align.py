@@ -119,8 +119,8 @@ class Alignment:
         if math.isnan(self.tilt):
             tilt = "not known: too few bands of rows show the sample"
         else:
-            turn, sure = math.degrees(self.tilt), math.degrees(self.uncertainty)
-            tilt = f"{turn:.3f}° ± {sure:.3f}°, {abs(self.lean):.2f} px between the first and the last row; "
+            turn, uncertainty = math.degrees(self.tilt), math.degrees(self.uncertainty)
+            tilt = f"{turn:.3f}° ± {uncertainty:.3f}°, {abs(self.lean):.2f} px between the first and the last row; "
             # the lower end of the axis is to the right of its upper end
             way = "clockwise" if turn > 0 else "anticlockwise"
             turned = (

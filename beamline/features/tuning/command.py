@@ -51,7 +51,8 @@ def tune(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: b
     if result.faults:
         if math.isnan(result.advised):
             raise QualityError(
-                "A scan would stop with these darks and flats, and no exposure time changes that: see FAULT above."
+                "A scan with these darks and flats would stop, and another exposure time would not help: see FAULT "
+                "above."
             )
         raise QualityError(
             f"Set the exposure to {result.advised:.4g} s: with the present exposure, a scan would stop because of "

@@ -98,7 +98,8 @@ class Tuning:
             ),
             (
                 "view",
-                f"transmission {middle:.3g} (median), {low:.3g} in its darkest 1 %, at {degrees(self.angle)}",
+                f"transmission {middle:.3g} (median), {low:.3g} in the darkest 1 % of the projection, at "
+                f"{degrees(self.angle)}",
             ),
             (
                 "noise",

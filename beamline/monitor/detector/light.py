@@ -36,7 +36,7 @@ class GainCheck(Logged):
     meaning: ClassVar[str] = "the beam intensity, or the gain of the camera, changed suddenly before this projection"
 
     warn: float = setting(0.01, "relative change of the intensity above which there is a warning", ge=0)
-    alarm: float = setting(0.1, "relative change above which there is an alarm", ge=0)
+    alarm: float = setting(0.1, "relative change of the intensity above which there is an alarm", ge=0)
 
     start = FrameScatter
 

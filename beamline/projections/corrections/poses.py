@@ -230,11 +230,11 @@ def _of_vectors(table: PoseTable, scan: SelectedScan) -> Geometry:
         raise ConfigError(f"{table.path} has vectors of {beam}, but {source.path} has another beam: {advice}.")
     size = selection.pixel_size_mm
     if size is None or abs(size - views.pixel_pitch) > _SAME_SIZE * size:
-        stated = "does not state its pixel size" if size is None else f"has pixels of {1e3 * size:.6g} um"
+        has_other_pixels = "does not state its pixel size" if size is None else f"has pixels of {1e3 * size:.6g} um"
         pitch_um = 1e3 * views.pixel_pitch
         raise ConfigError(
-            f"{table.path} has vectors for pixels of {pitch_um:.6g} um, but {source.path} {stated}; expected the "
-            "same size. Give --pixel-size-um, or vectors in mm."
+            f"{table.path} has vectors for pixels of {pitch_um:.6g} um, but {source.path} {has_other_pixels}; expected "
+            "the same size. Give --pixel-size-um, or vectors in mm."
         )
     rows = selection.detector_rows
     return views.rows(rows.start, rows.stop).binned(selection.binning)
@@ -296,8 +296,8 @@ def _rows_of_frames(table: PoseTable, source: ScanSource, frames: I64) -> I64:
                 stated = table.angles_deg[row_of_frame[frame]]
                 scan_degrees = degrees[frame]
                 raise DataError(
-                    f"{table.path} states frame {frame} at {stated:.6g} degrees, but {source.path} at "
-                    f"{scan_degrees:.6g}; expected the poses of the same scan."
+                    f"{table.path} states the angle {stated:.6g} degrees for frame {frame}, but {source.path} states "
+                    f"{scan_degrees:.6g} degrees; expected the poses of the same scan."
                 )
     return row_of_frame
 

@@ -289,7 +289,7 @@ def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.
         remedy = way if angles.size > n_views else ""
         raise DataError(
             f"{file.filename}: /exchange/theta has {angles.size} angles for {n_views} projections, shape "
-            f"{theta.shape}; expected one angle for each.{remedy}"
+            f"{theta.shape}; expected one angle for each projection.{remedy}"
         )
     return angles
 

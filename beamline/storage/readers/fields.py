@@ -90,7 +90,7 @@ def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source:
     if value.dtype.kind not in "uifb":
         return "the field is text; expected a number, with a known unit after the number or in the attribute `units`"
     unit = datasets.attribute(item, "units")
-    return f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
+    return f"its units {unit!r} are not known here" if unit else "it has no attribute `units`, so its unit is unknown"
 
 
 def _varying(field: Entry, item: h5py.Dataset, source: ScanSource) -> tuple[str, float]:
@@ -155,9 +155,9 @@ def _disagrees(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> b
 
 
 _ONE = (
-    "the value differs between projections, so the images differ in size, by up to {:.2g} px at the edge of the "
-    "field of view, but one value is used for all. Scale the images about the rotation axis to one pixel size, or "
-    "state the right pixel size with --pixel-size-um (cone beam: --cone)"
+    "the value differs between projections, so the images differ in size, by up to {:.2g} px at the edge of the field "
+    "of view, but one value is used for all projections. Scale the images about the rotation axis to one pixel size, "
+    "or state the right pixel size with --pixel-size-um (cone beam: --cone)"
 )
 _POSES = "give the shifts of the projections with --poses"
 _POINTS = (
@@ -346,8 +346,13 @@ EXCHANGE: tuple[Entry, ...] = (
         "height of a pixel, as x_pixel_size",
         units=EXCHANGE_LENGTH_UNITS,
     ),
-    Entry("measurement/instrument/detector/x_binning", "number of detector pixels in one column of the data"),
-    Entry("measurement/instrument/detector/y_binning", "number of detector pixels in one row of the data"),
+    Entry(
+        "measurement/instrument/detector/x_binning",
+        "number of detector columns that are binned to one column of the data",
+    ),
+    Entry(
+        "measurement/instrument/detector/y_binning", "number of detector rows that are binned to one row of the data"
+    ),
     Entry("measurement/instrument/detector/objective/magnification", "gives the pixel size at the sample"),
     Entry("exchange/theta_white", "angles of the flats; each projection is then corrected with the flats around it"),
     Entry("exchange/theta_dark", "angles of the darks"),
@@ -378,14 +383,14 @@ EXCHANGE: tuple[Entry, ...] = (
     ),
     Entry(
         "process/acquisition/flat_fields/num_flat_fields",
-        "number of flats in a group; if flat_field_mode is `Both`, half of data_white",
+        "number of flats in a group; used if flat_field_mode is `Both` and data_white has twice this number of flats",
     ),
     Entry(
         "process/acquisition/flat_fields/different_flat_exposure",
         "`Different` means that flats have flat_exposure_time",
     ),
-    Entry("measurement/instrument/detector/roi/x1", "columns count from the first one in the data", False),
-    Entry("measurement/instrument/detector/roi/y1", "rows count from the first one in the data", False),
+    Entry("measurement/instrument/detector/roi/x1", "columns count from the first column in the data", False),
+    Entry("measurement/instrument/detector/roi/y1", "rows count from the first row in the data", False),
     Entry("measurement/instrument/detector/geometry/translation/distances", UPRIGHT, False),
     Entry("measurement/instrument/detector/geometry/orientation/value", UPRIGHT, False),
     Entry("measurement/sample/geometry/translation/distances", _POSES, False),

@@ -119,8 +119,8 @@ def _unknown(path: Path) -> DataError:
             "`beamline export` writes it in another format."
         )
     return DataError(
-        f"{path} contains no scan in a known format: {known}. {held} Name the datasets of the scan: "
-        "--data-path, --angles-path, --darks-path, --flats-path."
+        f"{path} contains no scan in a known format. {held} Name the datasets of the scan: --data-path, --angles-path, "
+        f"--darks-path, --flats-path. Known formats: {known}."
     )
 
 

@@ -69,8 +69,8 @@ def find(file: h5py.File) -> list[Places]:
     if unresolved and not places:
         reason = unresolved[0]
         raise DataError(
-            f"{file.filename} has no frames: {reason}. The link points to another file: put that file back into the "
-            "folder of this one."
+            f"{file.filename} has no frames: {reason}. The link points to another file: put that other file back into "
+            f"the folder of {file.filename}."
         )
     return places
 

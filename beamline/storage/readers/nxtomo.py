@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.text import count
 from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import holds_arrays
 from beamline.storage.datasets import require_real
@@ -103,7 +104,7 @@ class NexusSource(ScanSource):
             linked_file = lost[0]
             raise DataError(
                 f"{self.path} refers to frames in {linked_file}, which does not exist or has another shape "
-                f"({len(lost)} such links)."
+                f"({count(len(lost), 'such link')})."
             )
 
     @property

@@ -284,8 +284,8 @@ def _refuse(options: SourceOptions, follow: bool) -> None:
     replaced += [f"--{name}" for name, given in (own_kinds | {"scanner-file": options.side_file}).items() if given]
     if follow and replaced:
         raise DataError(
-            f"{options.path} cannot be followed with {', '.join(replaced)}: this option replaces data of all frames, "
-            "but the scan is still adding frames. Wait until the scan has ended."
+            f"{options.path} cannot be followed with {', '.join(replaced)}: such an option replaces data of all "
+            "frames, but the scan is still adding frames. Wait until the scan has ended."
         )
     for one, other in (("angles", "angles_path"), ("darks", "darks_path"), ("flats", "flats_path")):
         if getattr(options, one) is not None and getattr(options, other) is not None:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.process import json_object
+from beamline.core.text import count
 from beamline.monitor.digest import has_checksum
 from beamline.plan.passes import ended_by
 from beamline.storage import datasets, hdf5, scan_file
@@ -62,8 +63,8 @@ class OwnScan(ScanSource):
         self.unpack_bytes = datasets.require_possible(data)
         if lost := datasets.missing_links(data):
             raise DataError(
-                f"{self.path} refers to frames in {lost[0]}, which does not exist or has another shape ({len(lost)} "
-                "such links)."
+                f"{self.path} refers to frames in {lost[0]}, which does not exist or has another shape "
+                f"({count(len(lost), 'such link')})."
             )
 
     def _cone(self) -> tuple[float, float] | None:

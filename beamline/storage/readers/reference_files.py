@@ -208,7 +208,7 @@ def _read(path: Path, item: Any) -> NDArray[Any]:
         )
     frames = as_frames(item)
     if frames.ndim != 3:
-        raise DataError(f"{item.name} in {path} is {item.shape}; expected images [frame, row, col].")
+        raise DataError(f"{item.name} in {path} has the shape {item.shape}; expected images [frame, row, col].")
     datasets.require_possible(frames)
     out = np.empty(frames.shape, frames.dtype)
     datasets.read_frames(frames, np.arange(len(frames)), slice(None), out)
@@ -249,7 +249,7 @@ def overlaid(
     for kind, images in given.items():
         if images.ndim != 3 or images.shape[1:] != base.shape or len(images) == 0:
             raise DataError(
-                f"The --{kind.name.lower()}s are {images.shape}; expected [frame, row, col] with frames of "
+                f"The --{kind.name.lower()}s have the shape {images.shape}; expected [frame, row, col] with frames of "
                 f"{base.shape} as in {base.path}."
             )
     if base.quantity == "unknown" and base.table.has(*{*_REFERENCES} - {*given}):

@@ -214,8 +214,8 @@ def refuse_packed(tif: tifffile.TiffFile) -> None:
     bits = tif.pages.first.bitspersample
     if bits > 8 and bits not in (16, 32, 64) and find_spec("imagecodecs") is None:
         raise ValueError(
-            f"the pixels are packed with {bits} bits each: pip install imagecodecs, which unpacks them, "
-            "or write the images with 16 bits per pixel"
+            f"the pixels are packed with {bits} bits each: pip install imagecodecs, which unpacks such pixels, or "
+            "write the images with 16 bits per pixel"
         )
 
 

@@ -190,7 +190,10 @@ def _of_one_energy(source: ScanSource, word: str) -> tuple[float, NDArray[np.boo
         raise DataError(f"Omit --frames {word}: {source.path} does not state the energy of each frame.")
     others = np.abs(known - kev) > _SAME_ENERGY * kev
     if not (np.isfinite(known) & ~others).any():
-        raise DataError(f"--frames {word}: no frame of {source.path} has this energy; {in_words(known)}.")
+        raise DataError(
+            f"--frames {word}: no frame of {source.path} has this energy. Projections at each energy: "
+            f"{in_words(known)}."
+        )
     return kev, others
 
 

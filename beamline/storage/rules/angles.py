@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.text import count
 from beamline.storage.rules import Finding
 from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.units import gone_round, look_like_degrees
@@ -33,10 +34,10 @@ def angles_unknown(scan: ScanEvidence) -> str:
     listed = "+".join(f"{run[0]}:{run[-1] + 1}" for run in runs[:_LISTED] if run.size) + "+..." * (len(runs) > _LISTED)
     if not unknown.size:
         return ""
-    first_frame = unknown[0]
+    first_frame, have = unknown[0], "has" if unknown.size == 1 else "have"
     return (
-        f"{unknown.size} of {views.size} projections have no angle (first: frame {first_frame}){reason}. Give the "
-        "angles with --angles FILE (degrees, one per "
+        f"{count(unknown.size, 'projection')} of {views.size} {have} no angle (first: frame {first_frame}){reason}. "
+        "Give the angles with --angles FILE (degrees, one per "
         f"line){f', or leave these projections out: --frames none={listed}' * (unknown.size < views.size)}."
     )
 
@@ -154,9 +155,9 @@ def _why_not_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64])
             "whole turn or more. These values look like counts of an encoder or of motor steps. Give the angles in "
             "degrees with --angles FILE (one per line). If the values are degrees, subtract whole turns."
         )
-    if (unit := _smaller_unit(distinct, angles.size)) is not None:
+    if (unit_sentence := _smaller_unit(distinct, angles.size)) is not None:
         return (
-            f"{angles.size} projections span only {np.ptp(distinct):.4g} degrees: {unit} Give the angles "
+            f"{angles.size} projections span only {np.ptp(distinct):.4g} degrees, so {unit_sentence} Give the angles "
             "in degrees with --angles FILE (one per line), or add --angles-unit rad."
         )
     return None
@@ -167,5 +168,7 @@ def _smaller_unit(degrees: NDArray[np.float64], n: int) -> str | None:
     degrees.
     """
     if part := gone_round(degrees, 2 * np.pi):
-        return f"these look like radians: {'180 degrees are' if part < 4 else '360 degrees are'} {part:.5g}."
-    return "these look like radians or turns." if n > _MANY and np.ptp(degrees) <= 2 * np.pi else None
+        return (
+            f"the angles look like radians, in which {'180 degrees are' if part < 4 else '360 degrees are'} {part:.5g}."
+        )
+    return "the angles look like radians or turns." if n > _MANY and np.ptp(degrees) <= 2 * np.pi else None

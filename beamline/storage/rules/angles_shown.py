@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.text import count
 from beamline.monitor.evidence import lit_places
 from beamline.storage.rules import Finding
 from beamline.storage.rules.evidence import ScanEvidence
@@ -377,10 +378,10 @@ def _alike_elsewhere(coarse: CoarseViews, rows: NDArray[np.int64]) -> Finding | 
     return Finding(
         "warning",
         ORDER,
-        f"{_stated(coarse, pair)} look more similar than neighbours do. {misplaced.sum()} of the {sampled.size} "
-        "compared projections look like a projection at a distant angle. If the "
-        "sample is not symmetric, either the angles are not in the order of the frames, or the sample rotated "
-        "further than the angles state.",
+        f"{_stated(coarse, pair)} look more similar than neighbouring frames do. {misplaced.sum()} of the "
+        f"{sampled.size} compared projections look like a projection at a distant angle. If the sample is not "
+        "symmetric, either the angles are not in the order of the frames, or the sample rotated further than the "
+        "angles state.",
     )
 
 
@@ -393,10 +394,12 @@ def _in_another_order(coarse: CoarseViews, jumps: NDArray[np.int64], far: Pair, 
     text = f"{_stated(coarse, far)} look similar, but f{_stated(coarse, near)[1:]} do not. "
     single = np.intersect1d(jumps, jumps + 1)  # between two jumps of the angles
     if single.size and jumps.size == 2 * single.size and single.size <= _SINGLE * coarse.rows.size:
-        wrong = ", ".join(f"{row} ({coarse.degrees[row]:.6g})" for row in coarse.rows[single[:5]].tolist())
+        wrong = ", ".join(
+            f"frame {row} ({coarse.degrees[row]:.6g} degrees)" for row in coarse.rows[single[:5]].tolist()
+        )
         text += (
-            f"The angles of {single.size} projections are not between the angles of the neighbouring "
-            f"projections: frames {wrong}. "
+            f"In {count(single.size, 'projection')} the angle is not between the angles of the neighbouring "
+            f"projections: {wrong}. "
         )
         return Finding("warning", ORDER, text + "Give the right angles with --angles FILE (degrees, one per line).")
     text += (

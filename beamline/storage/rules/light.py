@@ -123,7 +123,7 @@ def check_air_level(scan: ScanEvidence, level: float, air: bool, accepted: bool 
         factor = math.exp(abs(level))
         dark_or_bright = "dark" if level > 0 else "bright"
         sentence = (
-            f"{place_text} is {factor:.3g} times as {dark_or_bright} as the flats ({level:+.2f} in line integral, "
+            f"{place_text} is {factor:.3g} times as {dark_or_bright} as the flats ({level:+.2f} in line integral; "
             f"{use_text}). During one scan a beam changes by a factor of up to {math.exp(WARN):.2g}, and a sample can "
             "only absorb. Were the projections, flats and darks taken with the same settings and stored in the same "
             f"way? {_counts_in_words(scan)}"
@@ -179,7 +179,7 @@ def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
             "only add counts. Were the darks taken with beam, with another gain or exposure, or stored "
             "as sums of frames? Give --darks with the settings of the projections."
         )
-        sentence += "" if scan.request.accepted else " --references accept uses these as they are."
+        sentence += "" if scan.request.accepted else " --references accept uses the darks as they are."
         yield Finding("warning" if scan.request.accepted else "error", "light", sentence)
 
 
@@ -204,8 +204,8 @@ def _exposures_in_words(scan: ScanEvidence, *rows: NDArray[np.int64]) -> str:
         words = [f"{np.median(each):g} s" for each in exposures]
         return f"Stated exposures: flats {words[0]}, projections {words[1]}."
     return (
-        "Check whether flats and projections had the same exposure time: the file does not state it for both. If the "
-        "exposure times differ, the line integrals are wrong."
+        "Check whether flats and projections had the same exposure time: the file does not state both exposure times. "
+        "If the exposure times differ, the line integrals are wrong."
     )
 
 
@@ -287,7 +287,7 @@ def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
         flats_stated = bool((flats > 0).all())
         flat_exposures = scan.exposures[scan.table.flats]
         assumed_exposure = np.nan_to_num(flat_exposures, nan=usual).max(initial=0.0)
-        doubt = f"scaled to {usual:g} s" + (
+        scaling = f"scaled to {usual:g} s" + (
             "."
             if flats_stated
             else f". The file does not state the exposure of the flats. The program assumes {assumed_exposure:g} s, "
@@ -297,8 +297,8 @@ def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "info" if flats_stated else "warning",
             "exposures",
-            f"The projections were exposed for {views.min():g} to {views.max():g} s; the intensity of each "
-            f"projection is {doubt}",
+            f"The projections were exposed for {views.min():g} to {views.max():g} s; the intensity of each projection "
+            f"is {scaling}",
         )
     darks = darks[darks > 0]
     if darks.size and np.ptp(darks) <= EXPOSURE_TOLERANCE * usual < np.abs(darks - usual).max():  # never true for NaN

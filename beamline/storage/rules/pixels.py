@@ -69,7 +69,7 @@ def quantity_stated(scan: ScanEvidence) -> Iterator[Finding]:
     """
     if scan.source.quantity == "unknown":
         note = scan.source.attributes.get("quantity")
-        remark = "" if note is None else f"The file has only a remark ({str(note)[:80]!r}). "
+        remark = "" if note is None else f"The file has only a remark on the pixels ({str(note)[:80]!r}). "
         yield Finding(
             "error",
             "quantity",

@@ -111,9 +111,9 @@ def central_ray_taken(scan: ScanEvidence) -> Iterator[Finding]:
             yield Finding(
                 "warning",
                 f"central-{side}",
-                f"Give {option} {position:.6g} if the file is right: it states that the central ray meets "
-                f"{side} {position:.6g} (beam_center, from the centre of the first of {n}). The reconstruction "
-                f"assumes {taken}.",
+                f"Give {option} {position:.6g} if the file is right: the file states that the central ray meets {side} "
+                f"{position:.6g} (beam_center, counted from the centre of the first of {n} {side}s). The "
+                f"reconstruction assumes {taken}.",
             )
 
 
@@ -190,7 +190,8 @@ class Row:
 Rule = Callable[[ScanEvidence], Iterator[Finding]]
 RULES: tuple[Rule, ...] = (
     Row("error", "views", lambda scan: (n := scan.table.views.size) < 2 and (
-        f"The scan has {count(n, 'projection')}; a reconstruction needs at least 2, a good one hundreds."
+        f"The scan has {count(n, 'projection')}; a reconstruction needs at least 2 projections, and a good "
+        "reconstruction needs hundreds."
     )),
     Row("error", "angles", angles_unknown),
     Row("warning", "angles", lambda scan: (where := scan.source.attributes.get("angles_reversed")) and (

@@ -75,7 +75,7 @@ class NexusVolume:
     greys: bool = False
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
-        raise ValueError(f"{self.name} can be read but not written; write {NXtomoproc().name}.")
+        raise ValueError(f"{self.name} can be read but not written; choose the format {NXtomoproc().name} instead.")
 
     def holds(self, path: Path) -> bool:
         if not path.is_file() or not hdf5.is_hdf5(path):

@@ -311,7 +311,7 @@ class EpicsStage(LineStage):
             if field_value.label != wanted:
                 raise DeviceRefused(
                     self.name,
-                    f"{self._channel.name}{suffix} is {field_value}, so the record would not move",
+                    f"{self._channel.name}{suffix} is {field_value}, so the record would not move the motor",
                     expected=wanted,
                     advice="Set this field in the record's own screen; somebody may have stopped this motor on purpose",
                     state="Nothing has moved",
@@ -346,8 +346,8 @@ class EpicsStage(LineStage):
             advice = "Set counts_per_turn to 360 / MRES"
         elif 0 < float(fastest.value) < greatest * (1 - 1e-9):
             wrong = (
-                f"the maximum speed of the motor record (VMAX) is {fastest.value:g}, below {greatest:g} "
-                f"{settings.unit}/s"
+                f"the maximum speed of the motor record (VMAX) is {fastest.value:g}, below the maximum speed of "
+                f"{greatest:g} {settings.unit}/s in the configuration"
             )
             advice = "Set max_speed_deg_s to VMAX or less"
         if wrong:

@@ -187,7 +187,7 @@ class GcsLine:
                 reply=str(code),
                 expected="0, no error",
                 advice=advice(code),
-                state="That command had no effect" if refused and self.commanded else self._state(),
+                state="The command had no effect" if refused and self.commanded else self._state(),
             )
 
     def ask(self, request: str | bytes, form: str, meant: str) -> re.Match[str]:

@@ -71,7 +71,10 @@ class HomeSearch:
             reply=status.raw,
             expected="to be on the home switch",
             advice="Check the switch and its settings on the controller's panel, then search again",
-            state=f"The stage is at {status.counts} counts, but the search is not complete, so its angle is unknown",
+            state=(
+                f"The stage is at {status.counts} counts, but the search is not complete, so the angle of the stage "
+                "is unknown"
+            ),
         )
 
 

@@ -303,7 +303,7 @@ class ZaberAxis:
         if not reply.accepted:
             raise DeviceRefused(
                 self._name,
-                f"it rejected this: {REASONS.get(reply.data, 'a reason that this driver does not know')} "
+                f"it rejected the request: {REASONS.get(reply.data, 'a reason that this driver does not know')} "
                 f"({reply.data})",
                 request=words,
                 reply=reply.raw,

@@ -187,7 +187,7 @@ class AreaDetectorCamera:
                 f"the camera cannot take a software trigger now: it is {armed}, and its trigger is set to "
                 f"{self._settings.trigger}"
             )
-            raise DeviceRefused(self.name, problem, advice="Configure the trigger as software and arm it")
+            raise DeviceRefused(self.name, problem, advice="Set the trigger to software, and arm the camera")
         if self._labels.fire:
             self._records.write(f"cam1:{self._labels.fire}", 1)
         else:

@@ -52,8 +52,9 @@ def _print_example(ctx: click.Context, param: click.Parameter, value: bool) -> N
 @click.option(
     "--reference", metavar="GOOD", type=click.Path(path_type=Path, exists=True),
     help=(
-        "Volume of the same sample from an earlier scan with many projections, or the file of the earlier scan. It is "
-        "the reference of the live volume, as in `beamline scan`. The option replaces recon.reference in CONFIG."
+        "Volume of the same sample from an earlier scan with many projections, or the file of the earlier scan. This "
+        "volume is the reference of the live volume, as in `beamline scan`. The option replaces recon.reference in "
+        "CONFIG."
     ),
 )  # fmt: skip
 @click.option("--page", is_flag=True, help="Show the runs in the browser; all runs have the same address.")

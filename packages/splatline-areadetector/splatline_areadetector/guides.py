@@ -358,8 +358,8 @@ class TomoscanGuide:
         if not numbers or views < 1 or (views > 1 and step == 0.0):
             raise ConfigError(
                 f"tomoscan's settings give no angles: {self._prefix}NumAngles is {views:g}, RotationStep {step:g}, "
-                f"RotationStart {start:g}, NumDarkFields {darks:g}, NumFlatFields {flats:g}. Set them in tomoscan "
-                "before the scan begins. Nothing was recorded."
+                f"RotationStart {start:g}, NumDarkFields {darks:g}, NumFlatFields {flats:g}. Set these variables in "
+                "tomoscan before the scan begins. Nothing was recorded."
             )
         self._angles = np.radians(start + step * np.arange(int(views), dtype=np.float64))
         counts = {

@@ -41,7 +41,7 @@ def _prefix(ctx: click.Context, param: click.Parameter, value: str) -> str:
     default="127.0.0.1",
     show_default=True,
     metavar="ADDRESS",
-    help="Network address on which clients may connect; 0.0.0.0: any.",
+    help="Network address on which clients may connect; 0.0.0.0: all addresses.",
 )
 @click.option("--port", default=None, type=click.IntRange(0, 65535),
               help=(

@@ -74,8 +74,8 @@ class FrameFile:
         shape, dtype = self._data.shape[1:], self._data.dtype
         if frame.counts.shape != shape or frame.counts.dtype != dtype:
             raise DataError(
-                f"Capture these frames in another file: they are {frame.counts.dtype} {frame.counts.shape}, and "
-                f"{self.path} holds {dtype} {shape}"
+                f"Capture these frames in another file: the frames have the type {frame.counts.dtype} and the shape "
+                f"{frame.counts.shape}, but {self.path} has frames of the type {dtype} and the shape {shape}"
             )
         seconds = int(frame.time)
         values = {

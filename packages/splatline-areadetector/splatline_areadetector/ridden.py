@@ -188,7 +188,7 @@ class RiddenFrames:
         frame: ArrayFrame = seen.frame
         if isinstance(place, NewEpoch):
             self._epoch = place.why or self._other_size(frame)
-            self._warn(f"Closing this file and beginning another, because {self._epoch}.")
+            self._warn(f"Closing this file and beginning another file, because {self._epoch}.")
             for each in (*reversed(self._sorter.held), seen):
                 self._stream.put_back(each.frame)
             self._sorter.held.clear()
@@ -253,7 +253,7 @@ class RiddenFrames:
         (before, dtype), (after, dtype_after) = self._last.kind, frame.kind
         return (
             f"frames from number {frame.unique_id} on have {after.shape[0]} x {after.shape[1]} pixels of "
-            f"{dtype_after}, and earlier frames {before.shape[0]} x {before.shape[1]} pixels of {dtype}"
+            f"{dtype_after}, and earlier frames have {before.shape[0]} x {before.shape[1]} pixels of {dtype}"
             + ("" if (before.shape, dtype) != (after.shape, dtype_after) else ", and show another part of the sensor")
         )
 
@@ -340,7 +340,7 @@ class RiddenFrames:
         if not self._views:
             return f" The file has {count(self._row, 'frame')}, but no projection with an angle."
         counted_from = "" if self._sorter.basis.is_sure else f", counted from {self._sorter.basis.value}"
-        return f" Every other frame is in the file with the angle of its number{counted_from}."
+        return f" All other frames are in the file, each with the angle of its number{counted_from}."
 
 
 def seen_of(frame: ArrayFrame, guide: Guide, *, gone: bool = False) -> Seen:

@@ -243,7 +243,8 @@ class Sorter:
         if self._step:
             self._note = (
                 f"Do not use the frames up to {last.number}, because they may have a wrong kind or angle. From frame "
-                f"{seen.number} on, numbers rise by {step} instead of {block.step}, so frames were lost before."
+                f"{seen.number} on, numbers rise by {step} instead of {block.step}, so frames were lost before this "
+                "frame."
             )
             numbers = [block.first + block.step * trigger for trigger in block.triggers]
             if seen.phase == BY_ORDER:

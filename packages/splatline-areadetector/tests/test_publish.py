@@ -300,7 +300,10 @@ def test_frames_of_another_size_end_the_file_and_say_so(tmp_path: Path) -> None:
     shown.ask(cam1_Acquire=1)
     shown.take(1)
     shown.detector.take(replace(FRAME, counts=FRAME.counts[:2]))
-    assert r"they are uint16 (2, 4), and" in shown.said[0] and shown.values["HDF1:Capture_RBV"] == 0
+    assert (
+        r"the frames have the type uint16 and the shape (2, 4), but" in shown.said[0]
+        and shown.values["HDF1:Capture_RBV"] == 0
+    )
     with h5py.File(tmp_path / "a.h5") as file:
         assert len(file["/entry/data/data"]) == 1
 

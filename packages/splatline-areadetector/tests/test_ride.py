@@ -232,7 +232,7 @@ def test_a_lower_number_or_another_size_begins_another_file(tmp_path: Path) -> N
         in told.warnings
     )
     assert (
-        "frames from number 6 on have 8 x 24 pixels of uint16, and earlier frames 16 x 24 pixels of uint16"
+        "frames from number 6 on have 8 x 24 pixels of uint16, and earlier frames have 16 x 24 pixels of uint16"
         in told.warnings
     )
     files = stored(tmp_path)

@@ -38,9 +38,9 @@ class ContrastRegions:
     thickness: float | None = None
 
     def __post_init__(self) -> None:
-        for name, mask in (("inside", self.inside), ("around", self.around)):
+        for inside_or_around, mask in (("inside", self.inside), ("around", self.around)):
             if mask is not None and mask.sum() < 1:
-                raise ValueError(f"the region {name} the material has no pixels")
+                raise ValueError(f"the region {inside_or_around} the material has no pixels")
 
 
 @dataclass(frozen=True, eq=False)

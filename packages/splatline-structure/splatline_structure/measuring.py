@@ -75,8 +75,8 @@ def measured(path: Path, read: volumes.ReadSlices, box: volumes.Box, answer: Ans
         materials = (f"{each:g} is material {number}" for number, each in enumerate(labels, 1))
         answer.warn(
             Note(
-                f"{path} contains only few different values. These values are read as labels and not as grey "
-                f"values: {', '.join(materials)}."
+                f"{path} contains only a few different values. These values are read as labels and not as grey values: "
+                f"{', '.join(materials)}."
             )
         )
     if max(particles, values["through"]) > n_materials:

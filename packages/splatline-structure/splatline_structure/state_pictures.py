@@ -38,7 +38,7 @@ def pictures_of(reference: ReferenceParticles, states: Sequence[MeasuredState], 
         ),
         Picture(
             "Distribution over the particles",
-            "For each state, the share of the particles whose number is below the value on the axis.",
+            "For each state, the share of the particles whose measured number is below the value on the axis.",
             distributions(series, [state.path.name for state in states]),
         ),
         Picture(

@@ -117,8 +117,9 @@ def measure_states(paths: Sequence[Path], output: Path, answer: Answer, values: 
         if not fit.matches:
             answer.warn(
                 f"{path} shows another sample than {first}, or most of the sample has changed: at most 65 % of the "
-                "particles of the reference were found in this scan, or their grey levels fell to less than half. The "
-                "numbers of this state are not determined. Check the files, or take a later state as the reference."
+                "particles of the reference were found in this scan, or the grey levels of the particles fell to less "
+                "than half of those in the reference. The numbers of this state are not determined. Check the files, "
+                "or take a later state as the reference."
             )
     if not any(state.matches for state in states):
         raise DataError(

@@ -221,8 +221,8 @@ def box_in(volume: F32, crop: Crop) -> Box:
         box = inscribed_box((nz, ny, nx), sample_circle(known[None].astype(np.float32)), 0.0)
         if not known[box[1:]].all():
             raise ValueError(
-                "repair the volume: it has values that are not finite, and they are not all outside a circle as in a "
-                "masked volume"
+                "repair the volume: some values inside the square of --crop finite are not finite (a masked volume has "
+                "such values only outside a circle)"
             )
         return box
     y, x = (np.arange(n) - (n - 1) / 2 for n in (ny, nx))
@@ -320,8 +320,8 @@ def parts_of(
             slices = slice(slices.start - low, slices.stop - low)
         elif read.limit_sentence:
             raise ValueError(
-                "give --quick or --parts, because volumes from halves of cone-beam projections must be "
-                "reconstructed with all slices, and do not fit the memory"
+                "give --quick or --parts, because volumes from halves of cone-beam projections must be reconstructed "
+                "with all slices, which do not fit into the memory"
             )
         prepared = prepare_projections(picked, warn)
     views, geometry = prepared.views.seen, prepared.geometry

@@ -19,7 +19,7 @@ def _device_name(ctx: click.Context, param: click.Parameter, value: str) -> str:
 @click.option("--device", default="splatline/scan/1", show_default=True, callback=_device_name, metavar="NAME",
               help="Name of the device.")  # fmt: skip
 @click.option("--bind", default="127.0.0.1", show_default=True, metavar="ADDRESS",
-              help="Network address on which clients may connect; 0.0.0.0: any.")  # fmt: skip
+              help="Network address on which clients may connect; 0.0.0.0: all addresses.")  # fmt: skip
 @click.option("--port", default=10100, show_default=True, type=click.IntRange(1024, 65535),
               help="TCP port on which clients connect.")  # fmt: skip
 @click.option(

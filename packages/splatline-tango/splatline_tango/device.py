@@ -185,7 +185,7 @@ def serve(runs: Path, place: ServerPlace, control: bool, ready: Callable[[], Non
             why = (
                 error.args[0].desc
                 if isinstance(error, tango.DevFailed)
-                else "another program uses the port, or the address is not one of this computer"
+                else "another program uses the port, or the address is not an address of this computer"
             )
             raise DataError(f"{place} cannot be served: {why}. Nothing was started.") from error
 

@@ -156,8 +156,8 @@ def require_finite(reference: Volume) -> None:
     n_not_finite = sum(int(np.count_nonzero(~np.isfinite(each))) for each in voxels)
     if n_not_finite:
         raise ValueError(
-            f"{n_not_finite} of {voxels.size} voxels of the reference are not finite, but each must be an attenuation "
-            "in 1/mm; write 0 in places without material, and interpolate in places with material"
+            f"{n_not_finite} of {voxels.size} voxels of the reference are not finite, but each voxel must be an "
+            "attenuation in 1/mm; write 0 in places without material, and interpolate in places with material"
         )
 
 

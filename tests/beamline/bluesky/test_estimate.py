@@ -115,6 +115,6 @@ def test_a_plan_that_cannot_be_followed_has_a_fault(devices: tuple[Any, Any], mo
     plan = api.plan([reads(), endless(), plan_stubs.mv(rotation, 1000), plan_stubs.mv(rotation, 10)])
     said = [" ".join(map(str, scan.faults)) for scan in plan.scans]
     assert "because the plan raises an error if it gets no measured values (TypeError: 'NoneType' object" in said[0]
-    assert said[1] == "the plan may never end: it sent 100 messages, the most that this estimate follows"
+    assert said[1] == "the plan may never end: this estimate stopped after 100 messages of the plan"
     assert said[2] == "the plan moves rotation to 1000°, but the limits of the stage are -5° ... 365°"
     assert plan.scans[3].valid

@@ -54,7 +54,7 @@ def test_bad_references_are_told_and_limits_may_be_given(here: Path) -> None:
     write_exchange(here / "lit.h5", SCAN, {"data_dark": np.full((2, *SCAN.shape), 15000, np.uint16)})
     result = beamline("monitor", "lit.h5")
     assert result.exit_code == 7
-    assert "The darks 0-1: these darks were exposed to the beam." in result.stdout.splitlines()[3]
+    assert "Darks in frames 0-1: these darks were exposed to the beam." in result.stdout.splitlines()[3]
     limits = "--config", str(config_folder() / "demo.yaml"), "--set", "references.light_in_darks=0.9"
     assert "these darks were exposed" not in beamline("monitor", "lit.h5", *limits).stdout
     assert beamline("monitor", "lit.h5", "--set", "references.light_in_darks=0.9").exit_code == 2

@@ -94,7 +94,7 @@ FAULTS = {
     "mixed": (
         ('"sim://pm16c"', "COM3"),
         "my.yaml:7: devices.stage: simulated and real devices cannot be mixed, but camera, "
-        "shutter, sample_mover simulated and stage real",
+        "shutter, sample_mover are simulated, and stage is real",
     ),
     "stage of no kind": (
         ("kind: pm16c", "kind: pm16"),
@@ -106,7 +106,8 @@ FAULTS = {
     ),
     "counterpart of another stage": (
         ("kind: pm16c", "kind: pi_gcs"),
-        "my.yaml:7: devices.stage: port sim://pm16c is not the simulated counterpart of pi_gcs, sim://pi_gcs",
+        "my.yaml:7: devices.stage: port sim://pm16c does not fit kind pi_gcs; expected sim://pi_gcs, the simulated "
+        "controller of this kind",
     ),
     "a stage without a simulated controller": (
         ('kind: pm16c, port: "sim://pm16c"', 'kind: zaber, port: "sim://zaber"'),
@@ -120,8 +121,8 @@ FAULTS = {
     ),
     "an electrometer that sees no simulated beam": (
         ("  shutter:", "  beam_monitor: {kind: electrometer, port: COM4}\n  shutter:"),
-        "simulated and real devices cannot be mixed, but stage, camera, shutter, sample_mover simulated and "
-        "beam_monitor real",
+        "simulated and real devices cannot be mixed, but stage, camera, shutter, sample_mover are simulated, and "
+        "beam_monitor is real",
     ),
     "a pattern that finds nothing": (
         ("  shutter:", "  beam_monitor: {kind: ring_current, url: 'http://ring/', pattern: mA}\n  shutter:"),

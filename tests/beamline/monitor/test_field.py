@@ -51,9 +51,9 @@ def test_a_sample_beyond_the_field_is_a_fact_about_the_scan(first: int, sides: s
     (flag,) = of_field(Blobs(30, depth=lambda view, image: image + wide))
     assert flag.level is Level.INFO and flag.score == pytest.approx(0.4, abs=0.1) and sides in flag.advice
     assert flag.region is not None and abs(flag.region[2] - first * BLOCK) < 8 * BLOCK
-    assert "not centred on the rotation axis" not in flag.advice
+    assert "Centre the sample on the rotation axis" not in flag.advice
     (flag,) = of_field(Blobs(30, depth=lambda view, image: image + wide * (view > 12)))
-    assert "not centred on the rotation axis" in flag.advice and sides in flag.advice
+    assert "Centre the sample on the rotation axis" in flag.advice and sides in flag.advice
 
 
 def of_pixels(fake: Any, frames: list[Frame]) -> list[Flag]:

@@ -74,7 +74,7 @@ def test_a_single_group_of_flats_with_the_sample_in_is_refused(
 ) -> None:
     (hit,) = told(scan(balls, depth(balls, np.radians([degrees]), moved)[0], drift))
     assert (hit.severity, hit.rule) == ("error", "bad-references")
-    assert hit.message.startswith("The flats 4-7: ") and said in hit.message
+    assert hit.message.startswith("Flats in frames 4-7: ") and said in hit.message
 
 
 def test_views_that_show_nothing_beside_their_flats_are_named() -> None:

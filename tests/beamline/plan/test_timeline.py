@@ -327,7 +327,10 @@ REMARKS = {
         "period_s becomes 0.625 instead of 0.6, because the stage can turn at 8 counts/s, but not at 8.33333 counts/s",
     ),
     "margin": ({"period": 0.0512}, "less than 1 % above the camera's minimum of 0.051 s"),
-    "few views": ({"angles": angles.fixed(180)}, "180 projections are fewer than pi/2 x 252 columns = 396"),
+    "few views": (
+        {"angles": angles.fixed(180)},
+        "the scan has 180 projections; expected at least 396 (pi/2 x 252 columns)",
+    ),
     "no flats": ({"flats": FieldPlan(0, Place.NONE, 0.05)}, "no flats will be taken"),
     "no darks": ({"darks": FieldPlan(5, Place.NONE, 0.05)}, "no darks will be taken"),
     "exposure": (

@@ -47,11 +47,13 @@ def test_any_group_or_frame_of_another_kind_is_named_or_refused(
     try:
         found, told = decibels(blocks.source())
     except DataError as error:
-        assert f"The {kind.name.lower()}s" in str(error) or "The flats" in str(error)  # lit darks, and no beam in flats
+        assert f"{kind.name.capitalize()}s in " in str(error) or "Flats in " in str(
+            error
+        )  # lit darks, and no beam in flats
         assert groups == 1 and frame < 0  # no good group is left
         return
     assert found > clean(groups, 3) - 0.5
-    assert told and all(f"The {kind.name.lower()}s " in line and "used instead" in line for line in told)
+    assert told and all(f"{kind.name.capitalize()}s in " in line and "used instead" in line for line in told)
 
 
 @pytest.mark.slow
@@ -62,7 +64,7 @@ def test_one_lit_dark_does_not_change_a_volume(n: int) -> None:
         blocks.of(DARK)[0][0] += share * BEAM
         found, (line,) = decibels(blocks.source())
         assert found > clean(1, n) - 0.1
-        assert line.startswith("The darks 0: these darks were exposed to the beam")
+        assert line.startswith("Darks in frame 0: these darks were exposed to the beam")
 
 
 @pytest.mark.parametrize(("scale", "at"), others_slow([(1.0, 1), (0.05, 0), (3.0, 2)]))
@@ -71,7 +73,7 @@ def test_flats_with_the_sample_in_are_known_at_the_start_between_and_at_the_end(
     view = (0, VIEWS // 2, VIEWS - 1)[at]
     blocks.of(FLAT)[at][:] = blocks.taken(np.repeat(line_integrals(scale)[view : view + 1], 3, axis=0))
     found, told = decibels(blocks.source(), scale)
-    assert told[0].startswith("The flats ") and "in the beam" in told[0]
+    assert told[0].startswith("Flats in frames ") and "in the beam" in told[0]
     assert found > clean(3, 3, scale) - 0.5
 
 
@@ -95,7 +97,7 @@ def test_flats_through_anything_else_are_known_by_places_that_the_views_outshine
     blocks.of(FLAT)[at][:] = _flats_through(blocks, what)
     found, (line,) = decibels(blocks.source())
     rows = (3, 5) if at == 0 else (6 + VIEWS + 3, 6 + VIEWS + 5)
-    assert line.startswith(f"The flats {rows[0]}-{rows[1]}: the sample, or something else, was in the beam")
+    assert line.startswith(f"Flats in frames {rows[0]}-{rows[1]}: the sample, or something else, was in the beam")
     assert found > clean(2, 3) - 0.5
 
 
@@ -103,7 +105,7 @@ def test_a_group_of_flats_alone_with_the_sample_in_is_refused() -> None:
     """The views outshine them in places, and hold no more matter elsewhere."""
     blocks = Blocks(1, 3)
     blocks.of(FLAT)[0][:] = blocks.of(VIEW)[0][20:23]
-    with pytest.raises(DataError, match=r"flats 4-5: the sample was in the beam"):
+    with pytest.raises(DataError, match=r"Flats in frames 4-5: the sample was in the beam"):
         decibels(blocks.source())
 
 
@@ -116,7 +118,7 @@ def test_a_flat_without_counts_is_left_out(value: float, said: str) -> None:
     if value == 0:
         blocks.of(FLAT)[0][1] = value
     found, (line,) = decibels(blocks.source())
-    assert line.startswith("The flats 4: ") and said in line
+    assert line.startswith("Flats in frame 4: ") and said in line
     assert found > clean(1, 3) - 0.5
 
 
@@ -124,7 +126,7 @@ def test_a_dark_that_was_never_written_is_left_out() -> None:
     blocks = Blocks(1, 3)
     blocks.of(DARK)[0][0] = 0
     found, (line,) = decibels(blocks.source())
-    assert line.startswith("The darks 0: every pixel is 0") and found > clean(1, 3) - 0.1
+    assert line.startswith("Darks in frame 0: every pixel is 0") and found > clean(1, 3) - 0.1
 
 
 @pytest.mark.parametrize(("scale", "drift"), others_slow([(0.05, 0.15), (1.0, 0.05)]))

@@ -75,7 +75,8 @@ def test_line_integrals_that_were_never_written_are_left_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("cone", "ending"), [(None, "They are left out."), ((50.0, 100.0), "which leaves 32° without a projection.")]
+    ("cone", "ending"),
+    [(None, "These projections are left out."), ((50.0, 100.0), "which leaves 32° without a projection.")],
 )
 def test_rays_of_the_other_half_of_a_turn_fill_a_gap_only_in_a_parallel_beam(
     cone: tuple[float, float] | None, ending: str

@@ -112,7 +112,10 @@ def test_a_slab_that_its_method_makes_with_another_one_is_named(folder: Path, mo
 
     monkeypatch.setattr(FistaTv, "run", with_another)
     made = beamline(*FISTA, "-o", "out.h5")
-    record, sentence = read_reconstruction(Path("out.h5")), "were reconstructed with sirt instead: there is nothing to"
+    record, sentence = (
+        read_reconstruction(Path("out.h5")),
+        "were reconstructed with sirt, not with the method of the first slab: there is nothing to",
+    )
     assert made.exit_code == 0 and made.stderr.count(sentence) == 1, made.output
     others = np.array(record.parameters["slices_by_another_method"])
     assert record.method == "fista-tv" and f"Slices {others[0]} to {others[-1]} were reconstructed with" in made.stderr

@@ -173,8 +173,10 @@ def test_an_error_of_a_device_does_not_hide_what_was_lost_before_it() -> None:
     run = Run(instrument, instrument.timeline(n=12))
     assert isinstance(run.error, DeviceError) and "stopped short" in str(run.error)
     (told,) = run.warnings
-    assert told.startswith("1 of 12 projections is missing: 2 (from 30° to 30°). 1 were exposed but never delivered")
-    assert "1 frames came without a trigger" in told
+    assert told.startswith(
+        "1 of 12 projections is missing: 2 (at 30°). Exposed, but never delivered by the camera: 1 frame"
+    )
+    assert "1 frame came without a trigger" in told
 
 
 def test_a_stage_that_cannot_be_made_safe_is_said_though_the_data_are_good() -> None:

@@ -25,9 +25,9 @@ from tests.beamline.ran import Ran
 @pytest.mark.parametrize(
     ("light", "dark", "faults", "said"),
     [
-        (210, 200, Faults(), "The flats 3-4: these flats show no beam"),
-        (20000, 15000, Faults(), "The darks 0-2: these darks were exposed to the beam"),
-        (20000, 200, Faults(lost={3, 4}), "The 2 flats planned before the projections were not taken"),
+        (210, 200, Faults(), "Flats in frames 3-4: these flats show no beam"),
+        (20000, 15000, Faults(), "Darks in frames 0-2: these darks were exposed to the beam"),
+        (20000, 200, Faults(lost={3, 4}), "The scan did not take the 2 flats that its plan has before the projections"),
     ],
 )
 def test_no_projection_is_taken_after_references_that_cannot_be_used(
@@ -63,7 +63,7 @@ def test_bad_flats_at_the_end_are_told(tmp_path: Path, monkeypatch: pytest.Monke
     last_view = 16  # after three darks and two flats
     ran = Ran(tmp_path, FakeInstrument(at={last_view: lambda: monkeypatch.setitem(fakes.LEVEL, True, 210)}))
     assert ran.result.reference_faults == tuple(ran.warnings)
-    assert [text[:46] for text in ran.warnings] == ["The flats 17-18: these flats show no beam. Was"]
+    assert [text[:52] for text in ran.warnings] == ["Flats in frames 17-18: these flats show no beam. Was"]
 
 
 def test_flats_without_the_light_of_the_views_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -72,7 +72,7 @@ def test_flats_without_the_light_of_the_views_are_told(tmp_path: Path, monkeypat
     ran = Ran(tmp_path, instrument, "scan.flats.at=start")
     (fault,) = ran.result.reference_faults
     assert fault.startswith(
-        "The flats 3-4: these flats have only 9.09% of the intensity of the projections (limit 50%)"
+        "Flats in frames 3-4: these flats have only 9.09% of the intensity of the projections (limit 50%)"
     )
     assert [finding.severity for finding in validate(ran.result.path) if fault in finding.message] == ["error"]
 

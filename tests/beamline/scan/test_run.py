@@ -168,6 +168,5 @@ def test_what_a_device_said_of_the_time_before_is_a_warning(tmp_path: Path, monk
     ran = Ran(tmp_path, FakeInstrument())
     (warning,) = ran.of("warning")
     assert (
-        warning.data["message"]
-        == "stage: the settings in the device before this program opened it: displaced while at rest (WM)."
+        warning.data["message"] == "stage: this program found the device in this state: displaced while at rest (WM)."
     )

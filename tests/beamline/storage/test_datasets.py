@@ -131,7 +131,7 @@ def test_a_chunk_that_the_memory_cannot_unpack_is_refused_before(
             file["exchange"].create_dataset(name, data=of, chunks=of.shape, compression=packed)
     if refused:
         with pytest.raises(
-            DataError, match=r"chunks of 2\.4 kB: unpacking one needs 4\.8 kB of memory, and 1 kB are free"
+            DataError, match=r"chunks of 2\.4 kB: unpacking one chunk needs 4\.8 kB of memory, and 1 kB are free"
         ):
             open_scan(path)
     else:

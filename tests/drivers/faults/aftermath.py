@@ -87,9 +87,7 @@ def assert_next_scan_works(rig: Rig, runs: Path, tells: str = "") -> None:
         assert_complete(scanned)
         if words:
             (warning,) = scanned.warnings
-            assert re.fullmatch(
-                rf"stage: the settings in the device before this program opened it: {words}\.", warning
-            ), warning
+            assert re.fullmatch(rf"stage: this program found the device in this state: {words}\.", warning), warning
         else:
             assert scanned.warnings == []
         assert_at_rest(rig, scanned)

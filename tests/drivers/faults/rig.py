@@ -282,7 +282,11 @@ class Scanned:
     def warnings(self) -> list[str]:
         """Without those on darks and flats, which show no beam here."""
         said = [event.data["message"] for event in self.events if event.event == "warning"]
-        return [message for message in said if not re.match(r"The (\d+ )?(darks|flats)", message)]
+        return [
+            message
+            for message in said
+            if not re.match(r"(Darks|Flats) in frame|The scan did not take the \d+ (darks|flats)", message)
+        ]
 
     def of(self, name: str) -> list[Event]:
         return [event for event in self.events if event.event == name]

@@ -252,10 +252,10 @@ CAMERA: tuple[CameraFault, ...] = (
     CameraFault("an error of the library", DeviceError, "the camera's library reports an error"),
     CameraFault("camera unplugged", DeviceError, "NOCONNECTION"),
     CameraFault("setting refused", DeviceRefused, "it rejects EXPOSURETIME"),
-    CameraFault("frame lost in the camera", LedgerError, "were exposed but never delivered by the camera"),
+    CameraFault("frame lost in the camera", LedgerError, "Exposed, but never delivered by the camera"),
     CameraFault("ring overrun", LedgerError, "projections are missing"),
     CameraFault("triggers planned too fast", ConfigError, "set scan.period_s >="),
-    CameraFault("triggers too fast", LedgerError, "triggers gave no frame, because the camera was not ready"),
+    CameraFault("triggers too fast", LedgerError, "gave no frame, because the camera was not ready"),
     CameraFault("slow link", LedgerError, "`beamline check --connect` tests the link of the camera"),
 )
 

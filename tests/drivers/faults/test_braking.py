@@ -64,7 +64,7 @@ def check(rig: Rig, runs: Path, seed: int) -> None:
     views, invalid = rows[FrameKind.PROJECTION], len(rows[FrameKind.INVALID])
     assert len(set(views)) == len(views), seed
     assert invalid <= pulses, f"{seed}: views were left out without need"
-    assert (f"{invalid} frames came while the stage braked" in str(scanned.error)) is (invalid > 0), seed
+    assert ("came while the stage braked" in str(scanned.error)) is (invalid > 0), seed
     missing = set(range(max(views) + 1)) - set(views)
     assert missing == {int(i) for i in scanned.of("block_done")[-1].data["missing"]}, seed
     assert len(missing) <= pulses, seed

@@ -131,7 +131,7 @@ def test_frame_lost_in_the_camera_or_slow_link(rig: Rig, tmp_path: Path) -> None
     scanned = rig.scan(tmp_path)
     assert_ends_as("slow link", scanned)
     assert assert_lost(rig, scanned, tmp_path, "frame lost in the camera") == [3, 7]
-    assert "2 were exposed" in str(scanned.error)
+    assert "delivered by the camera: 2 frames" in str(scanned.error)
 
 
 def test_ring_overrun(rig_of: RigOf, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from tests.recon.prep.rims import views_of_can
 @pytest.mark.parametrize("square", [0.4, 2.0])
 def test_fringes_are_seen(square: float, change: dict[str, Any]) -> None:
     seen = Overshoot.of(views_of_can(square, **change)[0])
-    assert seen.certain and "below those of air" in seen.in_words()
+    assert seen.certain and "lower than in air" in seen.in_words()
     assert seen.share > 0.02
 
 

@@ -191,7 +191,7 @@ def test_what_cannot_be_is_refused() -> None:
     data = Projector(VIEWS, GRID).forward(_box())
     with pytest.raises(ValueError, match=">= 0 or None"):
         reconstruct(data, VIEWS, R2(steps=1, finish=-1))
-    with pytest.raises(ValueError, match="has no setting 'finish'; these methods have it: r2, r2-published"):
+    with pytest.raises(ValueError, match="has no setting 'finish'; methods that have this setting: r2, r2-published"):
         build(Fbp, {"finish": 2})
 
 

@@ -125,7 +125,9 @@ def test_a_certain_gain_is_one_over_a_candidate_with_a_prior_in_enough_projectio
             choice = choice.after(Prediction(name, (mean + scatter).tolist(), prior, costs_little=name == "pnp"))
         assert choice.chosen is not None
         if choice.predictions[choice.chosen].name == "pnp" and means.get("tv"):
-            certain = "pnp is 1.00% smaller than the residual of tv (standard error 0.00%). A gain below 2% suffices"
+            certain = (
+                "pnp is 1.00% smaller than the residual of tv (standard error 0.00%). Here a gain below 2% suffices"
+            )
             assert (certain in choice.reason) is (means["pnp"] == 0.99)
         return choice.predictions[choice.chosen].name
 

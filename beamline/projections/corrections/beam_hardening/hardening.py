@@ -158,7 +158,8 @@ def curve_of(views: F32, geometry: Geometry, step: Hardening) -> tuple[Curve | N
                 f"Beam hardening was not corrected, because the projections do not determine the curve ({error})."
             )
         origin_of_curve = (
-            f"fitted to the projections; a sample of one material explains {explained:.1%} of their values"
+            f"fitted to the projections; a sample of one material explains {explained:.1%} of the variance of the line "
+            "integrals"
         )
     corrected = float(np.interp(highest, curve.measured, curve.corrected))
     if corrected < (1 + _LEAST_INCREASE) * highest:
@@ -242,8 +243,8 @@ def fit_curve(views: F32, geometry: Geometry) -> tuple[Curve, float, float]:
 
     if geometry.is_cone:
         raise NoCurveError(
-            "--hardening fit needs a parallel beam, because only in a parallel beam the total absorption is the "
-            "same in all projections. Give --hardening MATERIAL:BEAM instead"
+            "--hardening fit needs a parallel beam, because only in a parallel beam is the total absorption the same "
+            "in all projections. Give --hardening MATERIAL:BEAM instead"
         )
     view_numbers, factor, reduced = _reduced(geometry)
     measured = np.concatenate([bin_views(views[view : view + 1], factor) for view in view_numbers])

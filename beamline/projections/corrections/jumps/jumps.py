@@ -151,7 +151,7 @@ def _sentence_on_jumps(confirmed: I64, jumps: I64, lost: int) -> str:
         verb = "is" if lost == 1 else "are"
         text.append(
             f"The sample jumped at {frames_text(confirmed)}. {count(lost, 'projection')} {verb} left out, because the "
-            f"sample was at another position there. {_REPAIRED}"
+            f"sample was at another position at that time. {_REPAIRED}"
         )
     if (unconfirmed := np.setdiff1d(jumps, confirmed)).size:
         text.append(

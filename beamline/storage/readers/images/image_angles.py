@@ -99,7 +99,7 @@ def _doubt_of_series(
     counted = are_a_count([each["value"] for each in chosen]) and (another or len(chosen[0]["value"]) > 3)
     uneven = chosen[0].re is _NUMBER and (np.abs(distinct).max() > _TURN or not _in_even_steps(distinct))
     if words and counted:
-        return "the number next to the word only counts the images"
+        return "the number next to the word for the angle only counts the images"
     if not words and uneven:
         return doubt or "the numbers with signs are not evenly spaced within 360 degrees"
     if distinct.size < _DISTINCT * len(chosen):

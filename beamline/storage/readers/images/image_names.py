@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
+from beamline.core.text import count
 from beamline.storage.readers.images.image_angles import NamedAngles, angles_in
 from drivers.base.frame import FrameKind
 
@@ -51,7 +52,9 @@ def kinds_of(path: object, names: Sequence[str]) -> dict[str, FrameKind]:
         series.setdefault(re.sub(r"\d+", "", short), []).append(name)
     sample = _sample_of(series, kinds)
     if sample is None:
-        numbers = ", ".join(f"{len(names_of_series)} of {key!r}" for key, names_of_series in [*series.items()][:6])
+        numbers = ", ".join(
+            f"{count(len(names_of_series), 'image')} like {key!r}" for key, names_of_series in [*series.items()][:6]
+        )
         raise DataError(
             f"{path} contains no projections, because all images are named as darks or flats ({numbers}). If the "
             "sample itself has a name like dark or flat, give only the folder of its projections, and the other "
@@ -272,7 +275,9 @@ def _several_series(path: object, names: Sequence[str], images: Sequence[str]) -
     templates = [_template(name) for name in names]
     if len(set(templates)) == 1:
         templates = [re.sub(r"\d+(?=\D*$)", "", name) for name in names]
-    numbers = ", ".join(f"{templates.count(kind)} of {kind!r}" for kind in sorted(set(templates))[:_LISTED])
+    numbers = ", ".join(
+        f"{count(templates.count(kind), 'image')} like {kind!r}" for kind in sorted(set(templates))[:_LISTED]
+    )
     places = ""
     with suppress(DataError):  # there is no order if images with the same names are again in several series
         if images:

@@ -131,11 +131,14 @@ class TiffSeriesSource(ScanSource):
             name = self.names[number]
             image = self._image(name)
             if image.shape != self.shape:
-                raise DataError(f"{name} in {self.path} is {image.shape}; the other frames are {self.shape}.")
+                raise DataError(
+                    f"{name} in {self.path} has the shape {image.shape}; the other frames have the shape {self.shape}."
+                )
             if not np.can_cast(image.dtype, self.dtype):
                 raise DataError(
-                    f"{name} in {self.path} has {image.dtype} pixels, but the frames before it have {self.dtype}, "
-                    "which cannot represent all of their values. Write all images of a scan in one pixel type."
+                    f"{name} in {self.path} has {image.dtype} pixels, but the frames before it have {self.dtype} "
+                    f"pixels, which cannot represent all values of {image.dtype}. Write all images of a scan in one "
+                    "pixel type."
                 )
             out[i] = image[rows]
         return out
@@ -226,12 +229,14 @@ class TiffSeriesSource(ScanSource):
 
     def _require_grey(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, int]:
         if not shape or math.prod(shape) == 0:
-            raise UnreadableError(f"{name} in {self.path} cannot be read as an image (the file contains none).")
+            raise UnreadableError(
+                f"{name} in {self.path} cannot be read as an image, because the file contains no image."
+            )
         if len(shape) != 2:
             raise _StacksError(
-                f"{name} in {self.path} is {shape}; expected one grey image per file. A folder of at most "
-                f"{_FEW_STACKS} files may have a stack of grey images in each. Give a single stack as "
-                "FILE, with --darks FILE and --flats FILE."
+                f"{name} in {self.path} has the shape {shape}; expected one grey image per file. A folder of at most "
+                f"{_FEW_STACKS} files may have a stack of grey images in each. Give a single stack as FILE, with "
+                "--darks FILE and --flats FILE."
             )
         require_real(dtype, f"{name} in {self.path}")
         return shape

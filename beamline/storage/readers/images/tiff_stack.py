@@ -102,7 +102,8 @@ class TiffStackSource(ScanSource):
             image = self._tif.pages.get(self._pages[page].index, aspage=True, cache=False).asarray()
             if (image.shape, image.dtype) != (self._stored, self.dtype):
                 raise ValueError(
-                    f"the page is {image.dtype} {image.shape}, but the first page is {self.dtype} {self._stored}"
+                    f"the page has {image.dtype} pixels and the shape {image.shape}, but the first page has "
+                    f"{self.dtype} pixels and the shape {self._stored}"
                 )
             return np.asarray(image)
         whole = np.empty(self._stored, self.dtype)

@@ -122,7 +122,9 @@ def _header(path: Path, file: TxrmFile) -> tuple[tuple[int, int, int], np.dtype[
     if kind not in _TYPES:
         raise DataError(f"{path} has {rows} x {cols} pixels of type {kind}; expected type 5 (uint16) or 10 (float).")
     if n * rows * cols * _TYPES[kind].itemsize > path.stat().st_size:
-        raise DataError(f"{path} states {n} images of {rows} x {cols} pixels, but the file is too small for them.")
+        raise DataError(
+            f"{path} states {n} images of {rows} x {cols} pixels, but the file is too small for these images."
+        )
     return (max(n, 0), rows, cols), _TYPES[kind], planned
 
 

@@ -248,7 +248,11 @@ def test_poses_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path) 
         ("view,roll_deg", (np.append(views, N), np.zeros(N + 1)), f"states view {N}, but .* has {N} views"),
         ("view,shift_col_px", (views, np.full(N, 321.0)), "view 0 is displaced by 321 columns and 0 rows"),
         ("view,shift_row_px", (views, np.full(N, 25.0)), "view 0 is displaced by 0 columns and 25 rows"),
-        ("view,angle_deg,roll_deg", (views, DEGREES + 2, TURNS[:, 0]), r"frame 4 at 2 degrees, .* at 0; .*same scan"),
+        (
+            "view,angle_deg,roll_deg",
+            (views, DEGREES + 2, TURNS[:, 0]),
+            r"angle 2 degrees for frame 4, .* states 0 deg.*same scan",
+        ),
         ("angle_deg,roll_deg", (DEGREES + 2.2, TURNS[:, 0]), "no pose for 40 of the 40 projections"),
     ):
         with pytest.raises(DataError, match=match):

@@ -136,9 +136,9 @@ def test_decimal_commas_are_read(images: Path, name: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "why"),
     [
-        ("60.000", "60,000", "60,000 has a comma beside 300.000 with a point"),
+        ("60.000", "60,000", "60,000 has a comma next to 300.000 with a point"),
         ("=60.000", "=1,165.25", "1,165.25 has a comma"),
-        (".000", ",000", "60,000 has a comma beside 40.00 with a point"),
+        (".000", ",000", "60,000 has a comma next to 40.00 with a point"),
     ],
 )
 def test_commas_that_may_be_of_thousands_are_refused(images: Path, old: str, new: str, why: str) -> None:

@@ -115,7 +115,7 @@ GOLDEN = np.arange(64) * 111.246
             "warning",
             "not between the angles of the neighbouring projections",
         ),
-        (EVEN[PASSES], EVEN, "warning", "look more similar than neighbours"),
+        (EVEN[PASSES], EVEN, "warning", "look more similar than neighbouring"),
     ],
     ids=["shifted", "passes stated", "shuffled", "end not written", "one wrong", "passes taken"],
 )

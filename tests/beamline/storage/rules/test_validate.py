@@ -117,10 +117,10 @@ def huge_pixels(file: h5py.File) -> None:
     ("spoil", "severity", "rule", "said"),
     [
         (shorter(f"{DETECTOR}/image_key", 2), "error", "readable", "unexpected structure"),
-        (shorter(ANGLE, 1), "error", "readable", r"rotation_angle is float64 \(13,\), expected .* 14 rows"),
+        (shorter(ANGLE, 1), "error", "readable", r"float64 and the shape \(13,\); expected .* 14 rows"),
         (attribute(ANGLE, units=None), "error", "readable", "no attribute units"),
         (attribute(ANGLE, units="mm"), "error", "readable", "'mm'"),
-        (put(ANGLE, np.nan, 8), "error", "angles", "1 of 9 projections .* frame 8"),
+        (put(ANGLE, np.nan, 8), "error", "angles", "1 projection of 9 .* frame 8"),
         (put(ANGLE, 30.0, slice(5, None)), "error", "angle-spread", "9 projections have the same angle, 30 degrees"),
         (put(ANGLE, np.linspace(0, 90, 9), slice(5, None)), "warning", "angle-spread", "90.00 degrees"),
         (put("entry/frame_log/time", EPOCH - 9.28, 6), "error", "time-order", "frame 6, by 9.88 s"),
@@ -187,11 +187,14 @@ DEGREES = np.arange(0, 180, 2.0)
         (DEGREES[np.random.default_rng(0).permutation(90)] * 1000, "look like counts of an encoder"),
         (DEGREES * 65536 / 360, "0 to 32403.9 degrees in steps of 364.1"),
         (np.arange(90) * 360.0, "0 to 32040 degrees in steps of 360"),
-        (np.radians(DEGREES), "span only 3.107 degrees: these look like radians: 180 degrees are 3.1416"),
-        (np.radians(2 * DEGREES), "radians: 360 degrees are 6.2832"),
-        (np.radians(np.linspace(-90, 90, 9)), "radians: 180 degrees are 3.1416"),
-        (DEGREES / 360, "span only 0.4944 degrees: these look like radians or turns"),
-        (np.radians(DEGREES) * 0.7, "these look like radians or turns"),
+        (
+            np.radians(DEGREES),
+            "span only 3.107 degrees, so the angles look like radians, in which 180 degrees are 3.1416",
+        ),
+        (np.radians(2 * DEGREES), "radians, in which 360 degrees are 6.2832"),
+        (np.radians(np.linspace(-90, 90, 9)), "radians, in which 180 degrees are 3.1416"),
+        (DEGREES / 360, "span only 0.4944 degrees, so the angles look like radians or turns"),
+        (np.radians(DEGREES) * 0.7, "the angles look like radians or turns"),
     ],
 )
 def test_angles_that_cannot_be_degrees(tmp_path: Path, theta: np.ndarray, said: str) -> None:

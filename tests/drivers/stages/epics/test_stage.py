@@ -37,7 +37,10 @@ def _stage(url: str, clock: TickingClock, **settings: Any) -> EpicsStage:
     [
         ({"unit": "mm"}, r"its unit \(EGU\) is 'mm', expected 'deg'"),
         ({"counts_per_turn": 36_000}, r"the step of the motor record \(MRES\) is 0.01 deg, expected 0.001"),
-        ({"fastest": 20.0}, r"the maximum speed of the motor record \(VMAX\) is 20, below 30 deg/s"),
+        (
+            {"fastest": 20.0},
+            r"the maximum speed of the motor record \(VMAX\) is 20, below the maximum speed of 30 deg/s in the conf",
+        ),
         ({"low": -5.0, "high": 99.0}, r"limited to -5.0000 deg to 99.0000 deg.*widen LLM and HLM"),
     ],
 )

@@ -102,7 +102,7 @@ def test_fringes_are_undone_by_default_and_said_with_the_ratio_where_it_is_known
     sentence = found.origin.done["phase"].sentence
     assert (
         "(from held-out projections)" in sentence
-        and "below those of air" in sentence
+        and "lower than in air" in sentence
         and "--phase none omits the filter" in sentence
     )
     length = float(sentence.split("over ")[1].split(" pixels")[0])
