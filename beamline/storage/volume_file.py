@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import zipfile
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -34,7 +35,8 @@ def read_volume(
 ) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:
     """Read a volume, and the voxel spacing in mm along its axes, if the file states it.
 
-    The spacing is stated by NIfTI, OME-Zarr, TIFFs of ImageJ and OME, and by `voxel_mm` (`slice_mm`) in an .npz.
+    The spacing is stated by NIfTI, OME-Zarr, TIFFs of ImageJ and OME, and by `voxel_mm` (`slice_mm`) in an .npz. There,
+    1 means a voxel of a pixel whose size is not known.
 
     Args:
         dataset: path in an HDF5 file or a Zarr, or name in an .npz; None: the only array with three axes.
@@ -232,6 +234,26 @@ def _from_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, fl
     return values.astype(np.float32 if scaled else dtype.newbyteorder("=")), (z, y, x)
 
 
+def has_only_a_volume(path: Path) -> bool:
+    """Whether an .npz holds a volume of the library (see `Volume.save`), or a single array of numbers with three axes."""
+    try:
+        with zipfile.ZipFile(path) as packed:
+            axes = {each.removesuffix(".npy"): _axes_of_member(packed, each) for each in packed.namelist()}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError):
+        return False
+    volume = axes.get("volume") if "voxel_mm" in axes else next(iter(axes.values())) if len(axes) == 1 else None
+    return volume == 3
+
+
+def _axes_of_member(packed: zipfile.ZipFile, name: str) -> int | None:
+    """Number of axes of an array in an .npz; None if it does not contain numbers."""
+    with packed.open(name) as member:
+        version = np.lib.format.read_magic(member)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(member)
+    return len(shape) if dtype.kind in "uif" else None
+
+
 def _from_numpy(path: Path, name: str | None) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:
     arrays = numpy_arrays(path)
     if "" in arrays:
@@ -243,6 +265,8 @@ def _from_numpy(path: Path, name: str | None) -> tuple[NDArray[np.generic], tupl
     if spacing is None or spacing.ndim != 0 or not (np.issubdtype(spacing.dtype, np.floating) and spacing > 0):
         return arrays[name], None
     slices = arrays.get("slice_mm", spacing)
+    if float(spacing) == float(slices) == 1:  # the pitch of a `Geometry` that does not state it
+        return arrays[name], None
     return arrays[name], (float(slices), float(spacing), float(spacing))
 
 

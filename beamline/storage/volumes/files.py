@@ -24,7 +24,7 @@ from beamline.storage.readers.formats import FORMATS as SCANS
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.structure import dtype_of, require_held, require_npy, shape_of
-from beamline.storage.volume_file import axes_of, read_volume
+from beamline.storage.volume_file import axes_of, has_only_a_volume, read_volume
 from beamline.storage.volumes import REGISTRY, formats
 from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_record, facts_of, marked, record_of
 from beamline.storage.writers.recon_file import (
@@ -208,6 +208,25 @@ class Npy:
         yield bare_record(path, np.load(path, mmap_mode="r", allow_pickle=False))
 
 
+@dataclass(frozen=True)
+class Npz:
+    """NumPy's archive: a volume that `result.save` of the library wrote, or a single array. This format is only read."""
+
+    name: str = "npz"
+    suffixes: tuple[str, ...] = ()
+    greys: bool = False
+
+    def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
+        raise ValueError(f"{self.name} can be read but not written; choose the format {NXtomoproc().name} instead.")
+
+    def holds(self, path: Path) -> bool:
+        return path.name.lower().endswith(".npz") and path.is_file() and has_only_a_volume(path)
+
+    @contextmanager
+    def open(self, path: Path) -> Iterator[ReconRecord]:
+        yield bare_record(path, *read_volume(path))
+
+
 def _header(path: Path) -> tuple[bytes, int]:
     """The header of an NRRD, and the position at which its data begin; (b"", 0) if the file has no header."""
     with path.open("rb") as file:
@@ -271,10 +290,10 @@ def write_volume(path: Path, record: ReconRecord, pixels: Pixels | None = None, 
 
 
 def volume_format(path: Path) -> VolumeFormat | None:
-    """The format of a file that is a volume: written by this program, or an .npy that is not a scan, or a NeXus file
-    whose default plot is a volume. None for other files.
+    """The format of a file that is a volume: written by this program, or an .npy that is not a scan, or an .npz with
+    a volume alone, or a NeXus file whose default plot is a volume. None for other files.
     """
-    kind_of_file = next((kind for kind in (*formats(), NexusVolume()) if kind.holds(path)), None)
+    kind_of_file = next((kind for kind in (*formats(), NexusVolume(), Npz()) if kind.holds(path)), None)
     # Voxels alone do not show their origin, so the readers of scans are asked first.
     if isinstance(kind_of_file, Npy) and any(scan.recognises(path, Opening()) for scan in SCANS):
         return None
@@ -291,7 +310,7 @@ def whole_volume(
         DataError: as for `opened_volume`.
     """
     kind = None if dataset is not None else volume_format(path)
-    if kind is None or isinstance(kind, NXtomoproc | Npy):
+    if kind is None or isinstance(kind, NXtomoproc | Npy | Npz):
         return read_volume(path, dataset)
     with kind.open(path) as record:
         values = np.asarray(record.volume.data[: record.volume.grid.shape[0]])

@@ -13,7 +13,7 @@ import pytest
 import tifffile
 
 from beamline.core.errors import DataError
-from beamline.features.files.validate import validate
+from beamline.features.files.validate import describe, validate
 from beamline.storage.readers.open import open_scan
 from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.volumes import formats, suffixes_text
@@ -232,6 +232,28 @@ def test_only_one_slice_is_in_memory_at_a_time() -> None:
 def test_what_no_volume_should_hold_is_found(tmp_path: Path, values: np.ndarray, said: str) -> None:
     write_volume(tmp_path / "v.tif", replace(RECORD, volume=Volume(values.astype(np.float32), RECORD.volume.grid)))
     assert [said in f.message for f in validate(tmp_path / "v.tif") if f.severity == "error"] == [True]
+
+
+@pytest.mark.parametrize(("edge", "unit", "spacing"), [(0.25, "mm", 0.25), (1.0, "px", 1.0)])
+def test_a_volume_of_the_library_is_a_volume(tmp_path: Path, edge: float, unit: str, spacing: float) -> None:
+    """An edge of 1 is that of a pixel whose size the caller did not state."""
+    Volume(VALUES, Grid(SHAPE, edge)).save(tmp_path / "v.npz", settings="{}")
+    assert volume_format(tmp_path / "v.npz") is not None
+    with opened_volume(tmp_path / "v.npz") as read:
+        np.testing.assert_array_equal(read.volume.data, VALUES)
+        assert (read.length_unit, read.volume.grid.spacing) == (unit, (spacing,) * 3)
+    described = describe(tmp_path / "v.npz")
+    assert described["format"] == "volume, npz"
+
+
+def test_an_archive_with_a_single_array_is_a_volume(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "v.npz", VALUES)
+    np.savez(tmp_path / "scan.npz", projections=VALUES, angles=np.arange(3.0))
+    np.savez(tmp_path / "angles.npz", np.arange(3.0))
+    (tmp_path / "no.npz").write_bytes(b"PK\x03\x04")
+    assert volume_format(tmp_path / "v.npz") is not None
+    for name in ("scan.npz", "angles.npz", "no.npz"):
+        assert volume_format(tmp_path / name) is None
 
 
 def test_a_scan_is_no_volume(tmp_path: Path) -> None:
