@@ -235,7 +235,7 @@ def _from_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, fl
 
 
 def has_only_a_volume(path: Path) -> bool:
-    """Whether an .npz holds a volume of the library (see `Volume.save`), or a single array of numbers with three axes."""
+    """Whether an .npz holds a volume of the library (see `Volume.save`), or a single array with three axes."""
     try:
         with zipfile.ZipFile(path) as packed:
             axes = {each.removesuffix(".npy"): _axes_of_member(packed, each) for each in packed.namelist()}

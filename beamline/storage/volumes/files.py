@@ -210,7 +210,7 @@ class Npy:
 
 @dataclass(frozen=True)
 class Npz:
-    """NumPy's archive: a volume that `result.save` of the library wrote, or a single array. This format is only read."""
+    """NumPy's archive: a volume that the library saved, or a single array. This format is only read."""
 
     name: str = "npz"
     suffixes: tuple[str, ...] = ()
