@@ -11,7 +11,7 @@ from typing import Any, get_args
 import click
 
 from beamline.cli.options import POSITIVE, Declared, NameChoice, WholeRange, declared, option, parsed, together
-from beamline.cli.recipe import METHOD, OUTPUT, RESOURCES, heading
+from beamline.cli.recipe import METHOD, OUTPUT, RESOURCES, heading, names_of_recipe
 from beamline.core.errors import DataError
 from beamline.reconstruct.combinations import EXCLUDED
 from recon.assess.time_model import PRESETS, parse_budget
@@ -81,13 +81,13 @@ def takers(option: Declared) -> tuple[str, ...]:
     return (*((AUTO,) if option.argument in Auto.takes else ()), *accepting(option.argument))
 
 
-def refuse_other_methods(command: click.Command, given_names: Collection[str], method: str, *, stated: bool) -> None:
+def refuse_other_methods(context: click.Context, given_names: Collection[str], method: str, *, stated: bool) -> None:
     """Raise UsageError for a given option that belongs to other methods than this one.
 
     Args:
         stated: True if the user chose the method; False if it is the default.
     """
-    of_methods = {name: param for name, param in declared(command).items() if param.setting or param.argument}
+    of_methods = {name: param for name, param in declared(context.command).items() if param.setting or param.argument}
     given_params = {name: param for name, param in of_methods.items() if name in given_names}
     if method in METHODS and all(param.setting for param in given_params.values()):
         own = by_name(method)
@@ -96,7 +96,8 @@ def refuse_other_methods(command: click.Command, given_names: Collection[str], m
     owners = {name: takers(param) for name, param in given_params.items()}
     for name in (name for name, methods in owners.items() if method not in methods):
         advice = f"it cannot be combined with --method {method}." if stated else _instead(name, owners)
-        raise click.UsageError(f"--{name} works only with {', '.join(owners[name])}; {advice}")
+        origin = " comes from --config, and it" if name in names_of_recipe(context) else ""
+        raise click.UsageError(f"--{name}{origin} works only with {', '.join(owners[name])}; {advice}")
 
 
 def _instead(name: str, owners: Mapping[str, Sequence[str]]) -> str:

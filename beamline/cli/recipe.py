@@ -57,6 +57,12 @@ def names_given(ctx: click.Context) -> set[str]:
     return {name_of(option) for option in given(ctx)}
 
 
+def names_of_recipe(ctx: click.Context) -> set[str]:
+    """The long names of the options that only a recipe gave."""
+    sources = {option: ctx.get_parameter_source(str(option.name)) for option in given(ctx)}
+    return {name_of(option) for option, source in sources.items() if source == ParameterSource.DEFAULT_MAP}
+
+
 def _is_of_one_call(option: click.Option) -> bool:
     return isinstance(option, Declared) and option.of_one_call
 

@@ -146,7 +146,7 @@ def _checked_method(context: click.Context, default: str = "") -> str:
         of_fits = values["follow"] or values["any_setting"] or (of_a_method & given_names) - {"budget", "quality"}
         method = default or (_in_time() if "volumes" in given_names else DEFAULT if of_fits else AUTO)
     refuse_contradictions(context.command, given_names, {SLABS_RESUMED: f"--resume {values['resume']}"})
-    refuse_other_methods(context.command, given_names, method, stated=stated)
+    refuse_other_methods(context, given_names, method, stated=stated)
     for step in chosen_steps(values) if values["follow"] and streams(method) else ():
         if step.needs_finished:
             raise click.UsageError(step.needs_finished)

@@ -64,6 +64,16 @@ def test_a_flag_that_a_recipe_switches_off_excludes_nothing_and_chooses_no_metho
     assert (result.exit_code, result.stdout) == (0, "method: auto\nbudget: 30s\n"), result.output
 
 
+def test_an_option_of_the_recipe_that_the_method_does_not_have_is_called_one_of_the_recipe(folder: Path) -> None:
+    """The user did not type it, so the message says where it comes from."""
+    Path("recipe.yaml").write_text("method: sirt\niterations: 3\n")
+    of_recipe = beamline("recon", "scan.h5", "--config", "recipe.yaml", "-m", "fbp", "-o", "v.h5")
+    typed = beamline("recon", "scan.h5", "--iterations", "3", "-m", "fbp", "-o", "v.h5")
+    assert (of_recipe.exit_code, typed.exit_code) == (2, 2)
+    assert "--iterations comes from --config, and it works only with" in of_recipe.output
+    assert "--config" not in typed.output
+
+
 def test_with_an_output_the_recipe_is_written_and_the_volume_made(folder: Path) -> None:
     succeeds("recon", "scan.h5", *OPTIONS, "--write-config", "both.yaml", "-o", "both.h5")
     assert (folder / "both.yaml").read_text() == read_reconstruction(folder / "both.h5").parameters["recipe"]
