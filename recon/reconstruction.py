@@ -236,7 +236,10 @@ def _views(projections: ArrayLike | Tensor | Counts | Views, geometry: Geometry 
         weights = None if projections.weights is None else projections.weights[...]
         return replace(projections, data=_line_integrals(projections.data, projections.geometry), weights=weights)
     if geometry is None:
-        raise ValueError("give the geometry of the projections; only Views contain it")
+        raise ValueError(
+            "give the geometry of the projections (the argument `geometry`). It can be left out only if the "
+            "projections are `Views`, which contain it"
+        )
     _refuse_geometry(geometry)
     used = used_views(geometry.n_views, use.held_out) if len(use.held_out) else None
     if not isinstance(projections, Counts):
@@ -260,8 +263,8 @@ def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.fl
     sampled = sampled[np.isfinite(sampled)]
     if sampled.size and (largest := float(np.quantile(sampled, 0.9))) > _LARGEST_LINE_INTEGRAL:
         raise ValueError(
-            "divide the line integrals by a constant; the volume is then divided by the same constant. One in ten "
-            f"line integrals is above {largest:.3g}. Line integrals up to {_LARGEST_LINE_INTEGRAL:g} are possible, "
-            "because the sums of squares of larger values exceed the range of float32"
+            f"the line integrals are too large: one in ten is above {largest:.3g}, and sums of squares of values above "
+            f"{_LARGEST_LINE_INTEGRAL:g} exceed the range of float32. Divide the line integrals by a constant; the "
+            "volume is then divided by the same constant"
         )
     return data

@@ -177,7 +177,9 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
         (interpolated_rows, "interpolated from their neighbours"),
     ):
         if dead_rows.size:
-            result = result_of_slices if layer == "slice" else "not used. Voxels that no other row shows are 0"
+            result = (
+                result_of_slices if layer == "slice" else "not used. Voxels that only these detector rows show are 0"
+            )
             warn(
                 f"No data in {count(dead_rows.size, layer)} of {len(masked)} (counted from 0: "
                 f"{spans(dead_rows.tolist())}), because in all projections these detector rows have no beam, zeros, "

@@ -172,8 +172,8 @@ def _from_folder(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, f
     ]:
         example = files[0]
         raise DataError(
-            f"Put each volume into a folder of its own: {path} contains several series of images: {len(files)} such "
-            f"as {example}, {', '.join(others)}."
+            f"Put each volume into a folder of its own. {path} contains several series of images: {len(files)} images "
+            f"such as {example}, {', '.join(others)}."
         )
     slices: NDArray[np.generic] | None = None
     for z, name in enumerate(files):

@@ -57,8 +57,8 @@ class Counts:
         flat: counts with the beam and without the sample, [row, col] or [view, row, col].
         dark: counts without the beam, a number or [row, col].
         gain: camera gain, counts per photon, see `photon_transfer`.
-        variance: variance of a pixel in one dark frame, counts², a number or [row, col]. The variance comes from the
-            readout, and from photons that carry no information about the sample.
+        variance: variance of a pixel in one dark frame, counts², a number or [row, col]. It is the noise of the
+            readout, and of photons that carry no information about the sample.
     """
 
     counts: ArrayLike

@@ -155,7 +155,9 @@ def _export_voxels(request: ExportRequest) -> None:
     from beamline.storage.volumes.files import format_of, opened_volume, write_volume
 
     if request.dataset is not None and request.at is not None:
-        raise click.UsageError("--at cannot be combined with --dataset: a time series has a single array.")
+        raise click.UsageError(
+            "--at cannot be combined with --dataset: --at chooses a volume of a time series, which has one dataset."
+        )
     pixels = Pixels(int(request.bits), request.window)
     if pixels.bits == 32 and request.window is not None:
         raise click.UsageError("--window needs --bits 8 or --bits 16.")

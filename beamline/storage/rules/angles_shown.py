@@ -197,8 +197,8 @@ def stage_stands_still(coarse: CoarseViews) -> Iterator[Finding]:
             "warning",
             "angle-spread",
             f"Give the angle of each of the {degrees.size} projections with --angles FILE (degrees, one per line), "
-            f"from {start:.6g} in equal steps if the stage rotated evenly.{first_of_each} The file states the same "
-            f"angle for {n} frames at a time, but the stage rotated between these frames: frames {one_frame} and "
+            f"from {start:.6g} in equal steps if the stage rotated evenly.{first_of_each} The scan file states the "
+            f"same angle for {n} frames at a time, but the stage rotated between these frames: frames {one_frame} and "
             f"{other_frame}, both at {stated_degrees:.6g} degrees, differ {times:.2g} times as much as neighbouring "
             "frames. The scan probably took frames faster than it read the angles.",
         )

@@ -79,7 +79,8 @@ class ZaberSettings(Wiring, StageFigures):
         super().__post_init__()
         if self.fires_when_enabled and not self.chained:
             raise ValueError(
-                "a trigger that fires when it is enabled needs another trigger that enables it: set chained to true"
+                "a trigger that fires when it is enabled needs another trigger that enables it: set `chained` of this "
+                "stage to true"
             )
         if self.starter == self.repeater:
             raise ValueError(f"starter and repeater must be two different triggers, got {self.starter} for both")

@@ -192,8 +192,8 @@ def refuse_mistakes(config: RideConfig, counters: Counters, frame: ArrayFrame | 
     plugin, seconds = counters.plugin.prefix, counters.plugin.number("MinCallbackTime_RBV")
     if seconds:
         raise ConfigError(
-            f"Set {plugin}MinCallbackTime to 0: it is {seconds:g} s, and the plugin skips frames that come sooner "
-            f"without an error. {_SKIPPED}"
+            f"Set {plugin}MinCallbackTime to 0: it is {seconds:g} s. If a frame comes sooner than this time after the "
+            f"frame before, the plugin skips it and reports no error. {_SKIPPED}"
         )
     _refuse_port(config.ride.source, counters)
     if frame is not None:

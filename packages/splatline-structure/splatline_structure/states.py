@@ -186,7 +186,7 @@ def _first_time(path: Path, record: Any, values: dict[str, Any]) -> float:
     with open_scan(path) as source:
         if source.cone is not None:
             raise DataError(
-                f"{path} is of a cone beam, and states are measured only with a parallel beam. Nothing was written."
+                f"{path} is a cone-beam scan, but `--states` needs parallel-beam scans. Nothing was written."
             )
         side = int(record.parameters.get("binning", 1))
         rays = math.prod(source.shape) // side**2 * int(source.table.views.size)

@@ -85,7 +85,7 @@ class Cgls(VoxelMethod):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """No settings: CGLS cannot use a time limit, because more iterations do not improve its volume."""
+        """Empty: a time limit sets no number of iterations of CGLS, because more iterations make its volume noisier."""
         return {}
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
@@ -129,11 +129,11 @@ class AsdPocs(VoxelMethod):
 
     Attributes:
         goal: relative residual ||A x - p|| / ||p|| at which the TV steps are no longer shortened. If `goal` is None,
-            the goal is 0.15 times the residual of filtered back-projection (FBP or FDK). FDK cannot reconstruct a short
-            cone scan. For a short cone scan the goal is 0.15 times the residual after one iteration of ordered-subset
-            SIRT. The residual after one iteration of ordered-subset SIRT is similar to the residual of FDK: with 20 to
-            180 projections of a box in a box, and 0 or 2 % noise, the residual is 0.085 to 0.12 for SIRT and 0.075 to
-            0.11 for FDK.
+            the goal is 0.15 times the residual of filtered back-projection (FBP or FDK). FDK cannot reconstruct a
+            cone-beam scan of less than 360°. For such a scan, the goal is 0.15 times the residual after one iteration
+            of ordered-subset SIRT. The residual after one iteration of ordered-subset SIRT is similar to the residual
+            of FDK: with 20 to 180 projections of a box in a box, and 0 or 2 % noise, the residual is 0.085 to 0.12 for
+            SIRT and 0.075 to 0.11 for FDK.
     """
 
     name: ClassVar[str] = "asd-pocs"

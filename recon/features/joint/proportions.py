@@ -200,12 +200,12 @@ def fit_share(
     """Fit the densities of two states of one material again. The sum of both densities does not change; the fraction of
     each state becomes smooth in space.
 
-    Held-out projections (one in eight, on some rows) decide how smooth the fraction is. Memory: ten volumes, six times
-    the projections.
+    Held-out projections decide how smooth this fraction is. (On some rows, one projection in eight is held out.)
+    Memory: ten volumes, six times the projections.
 
     Args:
         found: result of `fit_materials` from the same projections.
-        states: indices in `found.densities` of the two states.
+        states: the two states, as indices in `found.densities`.
         go_on: function called before each of at most `STEPS` steps, with the number of steps that may follow; if it
             returns False, `fit_share` returns `found` unchanged.
         stop: function called many times within a step; if it returns True, `fit_share` returns `found` unchanged.

@@ -150,8 +150,8 @@ def fit_series(
     particle takes up or loses material at its own time. Steps, memory, `go_on` and `stop` of `fit_series` are as in
     `fit_materials`. Up to four tests come before the fit: they choose the weights, decide whether the sample moves,
     estimate the motion, and choose the smoothness of the factors. During each test, and while the factors are fitted,
-    the first argument of `go_on` counts the remaining steps down to 0. If `go_on` ends the fit of the factors early,
-    the result is the volumes without factors.
+    the first argument of `go_on` counts the remaining steps down to 0. If `go_on` stops the fit of the factors
+    early, the result is the separate volumes, without factors.
 
     Use `motion=True` for a sample that settles. If only the densities of the sample change, `motion=True` finds motion
     that does not exist. For a sample that does not change, `tv_weight` has the same effect as the same weight for a

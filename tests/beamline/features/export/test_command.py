@@ -109,6 +109,6 @@ def test_a_folder_of_slices_of_another_program_is_a_volume(folder: Path) -> None
     np.testing.assert_array_equal(np.load(folder / "v.npy"), data)
     tifffile.imwrite(folder / "slices/rec_12.tif", data[0, :4])
     assert (
-        "rec_12.tif is float32 (4, 9); expected slices [y, x] of one type and shape"
+        "rec_12.tif has the type float32 and the shape (4, 9); expected slices [y, x] of the type float32 and the"
         in beamline("export", "slices", "-o", "w.npy").stderr
     )
