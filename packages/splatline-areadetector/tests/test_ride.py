@@ -281,7 +281,7 @@ def _nothing(stop: StopRequest) -> None:
 @pytest.mark.parametrize(
     ("records", "ride", "sentence"),
     [
-        ({"Pva1:MinCallbackTime_RBV": 0.5}, {}, "MinCallbackTime to 0: it is 0.5 s, and the plugin skips frames"),
+        ({"Pva1:MinCallbackTime_RBV": 0.5}, {}, "MinCallbackTime to 0: it is 0.5 s"),
         (
             {"Pva1:NDArrayPort_RBV": "OVER1"},
             {},

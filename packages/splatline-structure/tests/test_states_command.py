@@ -166,7 +166,7 @@ def test_after_ctrl_c_nothing_is_left(here: Path, monkeypatch: pytest.MonkeyPatc
         (("good.h5", "good.h5"), "good.h5"),
         (("volume.npy", *STATES), "does not state the voxel size"),
         (("state_b.h5", *STATES), "state_b.h5"),
-        (("good.h5", "state_a.h5", "cone.h5"), "states are measured only with a parallel beam"),
+        (("good.h5", "state_a.h5", "cone.h5"), "`--states` needs parallel-beam scans"),
         (("good.h5", "coarse.h5"), "the pixels are 1.3 µm wide"),
         (("holes.h5", *STATES), "1 of 294912 voxels of holes.h5 are not finite"),
         (("flat.h5", *STATES), "flat.h5 cannot be the reference"),
