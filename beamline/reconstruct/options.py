@@ -17,6 +17,7 @@ from beamline.reconstruct.combinations import SLABS_RESUMED
 from beamline.reconstruct.region import AroundSample, Region, box_around_sample, rows_around
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writer_lock import PATIENCE
+from beamline.storage.writers.recon_file import SUFFIXES
 from recon.base.choices import Quality
 from recon.base.declared_types import check_settings
 from recon.base.geometry import Geometry
@@ -169,15 +170,19 @@ class ReconOptions:
         return frozenset(name for name, value in values.items() if value not in (None, False))
 
     def disk_needs(self, volume: int, *, in_slabs: bool) -> tuple[int, int]:
-        """(bytes on disk for the result, bytes for temporary files), for a volume of `volume` bytes."""
+        """(bytes on disk for the result, bytes for temporary files), for a volume of `volume` bytes.
+
+        With a reference, an HDF5 file also contains the change and, unless the volume is made in slabs, the three
+        components of the displacement.
+        """
+        bars, change = self.uncertainty, self.reference is not None
+        beside = change * (1 if in_slabs else 4) if self.target.output.suffix.lower() in SUFFIXES else 0
+        output = volume * self.target.written * (1 + bars + beside)
         if not in_slabs:
-            return volume * self.target.written * (1 + self.uncertainty), 0
+            return output, 0
         compared = self.target.report is not None and self.method.fitted
         slabs = self.partial is None  # otherwise the file of the slabs already exists
-        bars = self.uncertainty
-        if not self.target.written:
-            return 0, (slabs + compared + bars) * volume
-        return (1 + bars) * volume, (slabs + compared + bars) * volume
+        return output, volume * (slabs * (1 + change) + compared + bars)
 
     def around_region(self, scan: SelectedScan) -> tuple[ReconOptions, SelectedScan]:
         """The options and the scan, narrowed to the detector rows that show the region; unchanged if the options ask

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from beamline.report.history import (
 from beamline.report.html import Picture, Report
 from beamline.report.metrics import METRICS, formatted
 from beamline.report.sheets import SliceSheet, contact_sheet, reference_sheet
-from beamline.storage.recon_record import Value
+from beamline.storage.recon_record import Value, VoxelsInFile
 from recon.base.method import Reconstruction
 from recon.base.views import spread
 from recon.base.volume import Volume, VolumeSeries
@@ -235,11 +236,18 @@ def _several(series: VolumeSeries) -> Iterator[Picture]:
         )
 
 
+def _moved_reference(volume: Volume, change: Volume) -> Volume:
+    """The volume minus its change. Slices are computed when they are used, because the volume may be on disk."""
+    voxels: Any = VoxelsInFile(volume.grid.shape, lambda part: volume.data[part] - change.data[part])
+    return Volume(voxels, volume.grid)
+
+
 def _displaced(result: Reconstruction, moved: Volume) -> str:
-    """A sentence on the displacement of the material."""
+    """A sentence on the displacement of the material; empty for a volume in slabs, whose displacement is not known."""
     if result.displacement is None:
         return ""
-    material = moved.data > _MATERIAL * np.percentile(moved.data, 99)
+    reference = np.asarray(moved.data)
+    material = reference > _MATERIAL * np.percentile(reference, 99)
     if not material.any():
         return ""
     voxels = np.sqrt(np.square(result.displacement[:, material]).sum(0)) / result.volume.grid.voxel_size
@@ -255,7 +263,7 @@ def _doubts(
     if unseen := unseen_wedges(prepared.geometry):
         yield Picture("Missing wedge", _of_wedges(unseen), pictures.wedges(result.volume, unseen, unit))
     if result.change is not None:
-        moved = Volume(result.volume.data - result.change.data, result.volume.grid)
+        moved = _moved_reference(result.volume, result.change)
         check = unexplained_by(moved, prepared.views.seen, np.random.default_rng(0))
         unexplained_change = check.alone(moved, prepared.geometry)
         yield Picture(

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from beamline.core.errors import DataError, ScanStopped
 from beamline.core.files import remove
@@ -146,11 +147,11 @@ class _SlabJob:
             slab, _ = self.made(n, self.run, decide, 0, first=True)
             if slab is None:
                 continue
-            record = _record(self.prepared, self.options, self.grid, self.begin)
+            record = _record(self.prepared, self.options, self.grid, self.begin, slab.change is not None)
             made_from = _provenance(self.prepared, self.options)
             path, decisions = self.options.partial_path, _kept(slab, decide)
             partial = create_partial(path, record, self.slabs, made_from, decisions)
-            partial.add(n, slab.volume.data)
+            partial.add(n, slab.volume.data, change=_change(slab))
             return partial, list(numbers[place + 1 :])
         raise DataError("There is no sample in the beam: the projections are zero everywhere.")
 
@@ -207,9 +208,17 @@ def _add(partial: PartialVolume, n: int, result: Reconstruction | None, remark: 
     """Add a slab. `warn` gets its remark, or a sentence if its method is not that of the first slab."""
     if not remark and result is not None and result.method != partial.kept["method"]:
         remark = _with_another_method(partial.slabs[n], result.method, result.chosen)
-    partial.add(n, None if result is None else result.volume.data, otherwise=bool(remark))
+    if result is None:
+        partial.add(n, None)
+    else:
+        partial.add(n, result.volume.data, change=_change(result), otherwise=bool(remark))
     if remark:
         warn(remark)
+
+
+def _change(result: Reconstruction) -> NDArray[np.float32] | None:
+    """The voxels of the change since a reference; None: the slab was reconstructed without a reference."""
+    return None if result.change is None else result.change.data
 
 
 def _with_another_method(slab: Slab, method: str, why: str) -> str:
@@ -254,11 +263,15 @@ def _provenance(prepared: PreparedProjections, options: ReconOptions) -> dict[st
     return {**origin_of(prepared, options.method, others), "weights": weights.hexdigest()}
 
 
-def _record(prepared: PreparedProjections, options: ReconOptions, grid: Grid, now: float) -> ReconRecord:
-    """The record of a partial volume, without voxels."""
-    path = Path(options.source.path)
+def _record(
+    prepared: PreparedProjections, options: ReconOptions, grid: Grid, now: float, with_change: bool
+) -> ReconRecord:
+    """The record of a partial volume, without voxels. `with_change`: the file also gets the change since a
+    reference."""
+    path, no_voxels = Path(options.source.path), np.broadcast_to(np.float32(0), grid.shape)
     return ReconRecord(
-        volume=prepared.with_true_heights(Volume(np.broadcast_to(np.float32(0), grid.shape), grid)),
+        volume=prepared.with_true_heights(Volume(no_voxels, grid)),
+        change=no_voxels if with_change else None,
         length_unit=prepared.origin.length_unit,
         raw_file=str(path.resolve()),
         title=f"Partial reconstruction of {path.name}",
@@ -288,7 +301,7 @@ def _finished(partial: PartialVolume, grid: Grid, options: ReconOptions, seconds
     history = tuple(Progress(*values) for values in stored["history"])
     return Reconstruction(
         Volume(partial.volume, grid), settings, history, method=stored["method"], seconds=seconds,
-        chosen=stored["chosen"],
+        chosen=stored["chosen"], change=None if partial.change is None else Volume(partial.change, grid),
         ending=Ending(resumed_from="" if options.partial is None else str(options.partial)),
     )  # fmt: skip
 

@@ -23,7 +23,7 @@ from beamline.storage import datasets, hdf5
 from beamline.storage.disk_file import reserve
 from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.writer_lock import WriterLock, held, opened_whole
-from beamline.storage.writers.recon_file import value_of, write_record
+from beamline.storage.writers.recon_file import CHANGE, value_of, write_record
 from recon.base.json_values import plain
 from recon.base.slabs import Slab
 
@@ -34,6 +34,8 @@ _PLACES = {
     "state": f"{_SLABS}/state",
     "shared_before": f"{_SLABS}/shared_before",
 }
+_CHANGE_PLACES = {"change": f"entry/data/{CHANGE}", "change_shared_before": f"{_SLABS}/change_shared_before"}
+_BEFORE = {"volume": "shared_before", "change": "change_shared_before"}  # the slices saved while a slab is added
 _MISSING, _ADDING, _DONE, _DONE_OTHERWISE = range(4)  # the last one: finished, by another method than the first slab
 
 
@@ -59,6 +61,11 @@ class PartialVolume:
         """float32 [z, y, x] as a memory map. Slices of missing slabs are zero."""
         return self._maps["volume"]
 
+    @property
+    def change(self) -> NDArray[np.float32] | None:
+        """float32 [z, y, x] as a memory map: the volume minus the moved reference; None: there is no reference."""
+        return self._maps.get("change")
+
     def has(self, n: int) -> bool:
         """True if slab n is finished."""
         return bool(self._maps["state"][n] >= _DONE)
@@ -74,26 +81,38 @@ class PartialVolume:
         chosen = np.flatnonzero(self._maps["state"] == _DONE_OTHERWISE).tolist()
         return [z for n in chosen for z in range(self.slabs[n].own.start, self.slabs[n].own.stop)]
 
-    def add(self, n: int, data: NDArray[np.float32] | None, *, otherwise: bool = False) -> None:
-        """Store slab n: [z, y, x] of all slices that were reconstructed for it. None: the slab is zero. `otherwise`:
-        the slab was reconstructed with another method than the first slab.
+    def add(
+        self,
+        n: int,
+        data: NDArray[np.float32] | None,
+        *,
+        change: NDArray[np.float32] | None = None,
+        otherwise: bool = False,
+    ) -> None:
+        """Store slab n: [z, y, x] of all slices that were reconstructed for it.
+
+        Args:
+            data: the volume; None: the slab is zero.
+            change: the volume minus the moved reference; None: the slab was reconstructed without a reference.
+            otherwise: True if the slab was reconstructed with another method than the first slab.
         """
-        slab, state, volume = self.slabs[n], self._maps["state"], self.volume
+        slab, state = self.slabs[n], self._maps["state"]
         if data is not None:
+            added = {"volume": data}
+            if self.change is not None:
+                added["change"] = data if change is None else change
             shared = _shared(slab)
-            self._maps["shared_before"][: len(shared)] = volume[shared]
-            self._written("shared_before")
+            for name in added:
+                self._maps[_BEFORE[name]][: len(shared)] = self._maps[name][shared]
+                self._written(_BEFORE[name])
             state[n] = _ADDING
             self._written("state")
-            for z, share, values in zip(range(*slab.slices.indices(len(volume))), slab.share, data, strict=True):
-                if share == 1:
-                    volume[z] = values
-                elif share > 0:
-                    volume[z] += share * values
-            self._written("volume")
+            for name, values in added.items():
+                _blend(self._maps[name], slab, values)
+                self._written(name)
         state[n] = _DONE_OTHERWISE if otherwise else _DONE
         self._written("state")
-        self._maps["done_text"][0] = f"{self.n_slices_done} of {len(volume)} slices"
+        self._maps["done_text"][0] = f"{self.n_slices_done} of {len(self.volume)} slices"
 
     def _written(self, name: str) -> None:
         """Return when the data are on the disk, so that no slab is counted that a loss of power could remove."""
@@ -103,7 +122,9 @@ class PartialVolume:
         """Remove the slab that was only partly added, if there is one."""
         for n in np.flatnonzero(self._maps["state"] == _ADDING).tolist():
             shared = _shared(self.slabs[n])
-            self.volume[shared] = self._maps["shared_before"][: len(shared)]
+            for name, before in _BEFORE.items():
+                if name in self._maps:
+                    self._maps[name][shared] = self._maps[before][: len(shared)]
             self._maps["state"][n] = _MISSING
 
 
@@ -111,7 +132,7 @@ def create_partial(
     path: Path, record: ReconRecord, slabs: Sequence[Slab], made_from: Mapping[str, Value], kept: Mapping[str, Any]
 ) -> PartialVolume:
     """Create a file without slabs. The arguments are the attributes of `PartialVolume`, and `record` without its
-    voxels.
+    voxels. The slabs also have a change if `record` has one.
 
     Raises:
         DataError: the path exists, or the disk has too little free space. No file is left.
@@ -128,9 +149,11 @@ def create_partial(
             for name, value in made_from.items():
                 group[f"made_from/{name}"] = value
             deepest = max(1, *(len(_shared(slab)) for slab in slabs))
-            shared = file.create_dataset(_PLACES["shared_before"], (deepest, *shape), np.float32)
-            # this allocates the space at the end of the file; HDF5 removes it when it closes the file
-            shared[-1, -1, -1] = 0
+            places = _PLACES if record.change is None else _PLACES | _CHANGE_PLACES
+            for place in (places[name] for name in _BEFORE.values() if name in places):
+                shared = file.create_dataset(place, (deepest, *shape), np.float32)
+                # this allocates the space at the end of the file; HDF5 removes it when it closes the file
+                shared[-1, -1, -1] = 0
         with partial.open("r+b") as whole:
             reserve(whole.fileno(), partial.stat().st_size, path.parent)
     return open_partial(path)
@@ -149,9 +172,10 @@ def open_partial(path: Path) -> PartialVolume:
         slabs = _slabs_in(group)
         made_from = {name: value_of(node) for name, node in group["made_from"].items()}
         kept = json.loads(group["kept"][()])
+        places = _PLACES | (_CHANGE_PLACES if _CHANGE_PLACES["change"] in file else {})
         maps = {
             name: np.memmap(path, item.dtype, "r+", item.id.get_offset(), item.shape or (1,))
-            for name, item in ((name, file[place]) for name, place in _PLACES.items())
+            for name, item in ((name, file[place]) for name, place in places.items())
         }
     volume = PartialVolume(path, slabs, made_from, kept, maps, lock)
     volume._take_out()
@@ -196,6 +220,15 @@ def is_partial(path: Path) -> bool:
             return isinstance(datasets.resolve(file, _SLABS), h5py.Group)
     except (DataError, OSError):
         return False
+
+
+def _blend(volume: NDArray[np.float32], slab: Slab, data: NDArray[np.float32]) -> None:
+    """Add the slices of a slab to a volume, each times its share."""
+    for z, share, values in zip(range(*slab.slices.indices(len(volume))), slab.share, data, strict=True):
+        if share == 1:
+            volume[z] = values
+        elif share > 0:
+            volume[z] += share * values
 
 
 def _shared(slab: Slab) -> list[int]:

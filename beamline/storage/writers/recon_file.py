@@ -58,7 +58,7 @@ def write_record(path: Path, record: ReconRecord, *, empty: bool = False) -> Non
     """Write the new file `path`, sixteen slices at a time. Raises OSError if the disk failed.
 
     Args:
-        empty: True: the voxels are not written, but their space is allocated as one block of zeros.
+        empty: True: the voxels are not written, but their space is allocated as blocks of zeros.
     """
     with hdf5.created(path) as file:
         write_entry(file, record, empty)
@@ -90,9 +90,11 @@ def write_entry(file: hdf5.NewFile, record: ReconRecord, empty: bool) -> None:
     if record.series is not None:
         data["time"] = record.series.seconds
         data["time"].attrs["units"] = "s"
-    for name, (values, what) in () if empty else _beside(record).items():
-        other = data.create_dataset(name, shape, np.float32, chunks=(1, *shape[1:]))
-        for first in range(0, shape[0], _SLAB):
+    for name, (values, what) in _beside(record).items():
+        other = data.create_dataset(name, shape, np.float32, chunks=None if empty else (1, *shape[1:]))
+        if empty:
+            other[-1, -1, -1] = 0
+        for first in range(0, 0 if empty else shape[0], _SLAB):
             other[first : first + _SLAB] = values[first : first + _SLAB]
             file.require_taken()
         unit = record.length_unit if name.startswith(DISPLACEMENT) else record.unit

@@ -58,7 +58,7 @@ def interrupt_after(monkeypatch: pytest.MonkeyPatch, slabs: int, *, half: bool =
     """Ctrl-C when so many slabs were added; `half`: in the middle of adding the next one."""
     add, added = PartialVolume.add, list[Any]()
 
-    def adding(self: PartialVolume, n: int, data: np.ndarray | None, **more: bool) -> None:
+    def adding(self: PartialVolume, n: int, data: np.ndarray | None, **more: Any) -> None:
         if len(added) == slabs and not half:
             raise KeyboardInterrupt
         if len(added) == slabs:

@@ -29,6 +29,7 @@ from beamline.report.live_picture import PictureRow, reference_row
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import opened_volume, write_volume
+from beamline.storage.writers.partial_volume import PartialVolume
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
 from recon.base.method import Preview
@@ -222,14 +223,53 @@ def test_slabs_with_a_reference_are_the_whole_volume(
         file.attrs["pixel_size_mm"] = 1.0
     for name, memory in (("whole.h5", "1G"), ("parts.h5", "16M")):
         done = beamline("recon", str(state), "--reference", str(good), "--axis", "23.5", "--quality", "preview",
-                        "--no-report", "--memory", memory, "-o", str(tmp_path / name))  # fmt: skip
+                        "--memory", memory, "-o", str(tmp_path / name))  # fmt: skip
         assert done.exit_code == 0, done.output
         assert "The reference was used" in done.output
     whole, parts = (read_reconstruction(tmp_path / name) for name in ("whole.h5", "parts.h5"))
     assert int(str(parts.parameters["slabs"])) > 1
+    changes, moved = [], []
+    for name, record in (("whole.h5", whole), ("parts.h5", parts)):
+        with h5py.File(tmp_path / name) as file:
+            changes.append(file["entry/data/change"][()])
+            assert ("displacement_z" in file["entry/data"]) is (name == "whole.h5")
+            assert file["entry/data/change"].attrs["units"] == "1/mm"
+        moved.append(record.volume.data - changes[-1])
+        assert "Change since the reference" in (tmp_path / name).with_suffix(".html").read_text()
+    np.testing.assert_allclose(moved[1], moved[0], atol=0.1 * float(truth.max()))
+    assert psnr(moved[1], after) > psnr(truth, after) + 3, "the reference is moved in each slab"
+    add, added = PartialVolume.add, list[int]()
+
+    def stopped_within_the_second(self: PartialVolume, n: int, data: np.ndarray | None, **more: Any) -> None:
+        add(self, n, data, **more)
+        added.append(n)
+        if len(added) == 2:
+            self._maps["state"][n] = 1  # the slab counts as added in part
+            raise KeyboardInterrupt
+
+    arguments = ("recon", str(state), "--reference", str(good), "--axis", "23.5", "--quality", "preview", "--no-report",
+                 "--memory", "16M", "-o", str(tmp_path / "again.h5"))  # fmt: skip
+    with monkeypatch.context() as patch:
+        patch.setattr(PartialVolume, "add", stopped_within_the_second)
+        assert beamline(*arguments).exit_code == 4
+    resumed = beamline(*arguments, "--resume", str(tmp_path / "again.partial.h5"))
+    assert resumed.exit_code == 0, resumed.output
+    with h5py.File(tmp_path / "again.h5") as file:
+        np.testing.assert_array_equal(file["entry/data/data"][()], parts.volume.data)
+        np.testing.assert_array_equal(file["entry/data/change"][()], changes[1])
     assert psnr(parts.volume.data, after) > psnr(whole.volume.data, after) - 0.1
     between = np.square(parts.volume.data - whole.volume.data).mean()
     assert between < 0.3 * np.square(whole.volume.data - after).mean(), "they differ by less than the error"
+
+
+def test_the_disk_space_counts_the_change_and_the_displacement(tmp_path: Path) -> None:
+    options = ReconOptions(SourceOptions(tmp_path / "state.h5"), OutputPaths(tmp_path / "out.h5", None), Selection(),
+                           FromReference(), reference=tmp_path / "good.h5")  # fmt: skip
+    assert options.disk_needs(100, in_slabs=False) == (500, 0)
+    assert options.disk_needs(100, in_slabs=True) == (200, 200)
+    tiff = replace(options, target=OutputPaths(tmp_path / "out.tif", None))  # holds only the volume
+    assert tiff.disk_needs(100, in_slabs=False) == (100, 0) and tiff.disk_needs(100, in_slabs=True) == (100, 200)
+    assert replace(options, reference=None).disk_needs(100, in_slabs=True) == (100, 100)
 
 
 def test_help_states_the_option() -> None:
