@@ -408,6 +408,11 @@ class Method(Checked, ABC):
         return 0
 
     @property
+    def costs_little(self) -> bool:
+        """Whether the method, which is tried after total variation, takes at most about three times as long."""
+        return False
+
+    @property
     def alternatives(self) -> tuple[Method, ...]:
         """The methods from which this method chooses, the preferred one first. A method that does not choose returns
         only itself."""

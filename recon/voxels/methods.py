@@ -275,6 +275,10 @@ class PnpDct(VoxelMethod):
         """Number of PnP-DCT steps in a test reconstruction: `iterations`, but at most the default of `iterations`."""
         return min(self.iterations, PnpDct.iterations)
 
+    @property
+    def costs_little(self) -> bool:
+        return self.iterations <= PATCH_STEPS
+
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
         """Empty: no setting of PnP-DCT depends on a time limit, because its number of steps is fixed."""
@@ -295,7 +299,7 @@ class PnpDct(VoxelMethod):
             prediction = trial.predicted(self)
         else:
             prediction = trial.prediction(self.name, trial.residuals_of_patches(trial.prior.strength), trial.prior)
-        return prediction._replace(costs_little=self.iterations <= PATCH_STEPS)
+        return prediction._replace(costs_little=self.costs_little)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         sweeps = 0 if x.any() else self.first_sweeps

@@ -373,8 +373,9 @@ class Trial:
         tried.
 
         A candidate is run unchanged on the projections that are not held out. If it has a method `predict`, this method
-        finds its residuals with a part of the work. If discrete levels already predict these projections better,
-        further candidates are not run, unless the best one is requested (`least_gain` 0).
+        finds its residuals with a part of the work. If discrete levels already predict these projections better (see
+        `TrialChoice.levels_suffice`), further candidates are not run, unless the best one is requested (`least_gain`
+        0).
 
         Args:
             candidates: the candidates, the simplest and cheapest first.
@@ -385,7 +386,7 @@ class Trial:
             try:
                 prediction = (
                     Prediction(each.name, remark=f"{each.name} not tried, because {_LEVELS_PREDICT}")
-                    if least_gain > 0 and choice.levels_suffice
+                    if least_gain > 0 and choice.levels_suffice(costs_little=each.costs_little)
                     else each.predict(self, choice) if isinstance(each, Predicting) else self.predicted(each)
                 )  # fmt: skip
             except (ValueError, LibraryError) as error:
