@@ -92,7 +92,11 @@ def installation_problem(error: BaseException) -> str:
 
 
 def as_one_line(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """A `sys.excepthook` that prints in one line which library cannot be loaded."""
+    """A `sys.excepthook` that prints in one line which library cannot be loaded, or that Ctrl-C ended the command while
+    it was loaded."""
+    if issubclass(kind, KeyboardInterrupt):
+        sys.stderr.write("beamline: interrupted\n")
+        sys.exit(130)  # as errors.INTERRUPTED, in a module that is loaded later
     if problem := installation_problem(error):
         sys.stderr.write(f"beamline: {problem}\n")
         sys.exit(2)

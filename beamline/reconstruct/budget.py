@@ -41,21 +41,22 @@ def in_budget(
             refusals.append(f"{each.name}: {error}")
     if not affordable:
         raise ValueError("; ".join(refusals))
-    chosen, expected = _without_slow(method, affordable), 0.0
+    chosen, expected, out = _without_slow(method, affordable), 0.0, list[str]()
     while (expected := timing.of(chosen).most) > end - now() and len(affordable) > 1:
-        affordable.remove(max(affordable, key=lambda each: seconds[each.name]))
+        slowest = max(affordable, key=lambda each: seconds[each.name])
+        affordable.remove(slowest)
         chosen = _without_slow(method, affordable)
+        out.append(f"with {slowest.name}, tests and volume would take about {duration_text(expected)}")
     if (excess_seconds := expected - (end - now())) > 0:
         fastest_name = affordable[0].name
         warn(
             f"{duration_text(budget)} is too short for this scan: even the fastest method, {fastest_name}, which is "
             f"used now, will end about {duration_text(excess_seconds)} after this limit."
         )
-    names = [each.name for each in affordable]
-    out = [
-        f"{name} would take about {duration_text(duration)}" for name, duration in seconds.items() if name not in names
-    ]
-    return chosen, "; ".join((f"{duration_text(budget)} for {' or '.join(names)}", *out))
+    if out:
+        out.append(f"about {duration_text(max(0.0, end - now()))} remained")
+    names = " or ".join(each.name for each in affordable)
+    return chosen, "; ".join((f"{duration_text(budget)} for {names}", *out))
 
 
 def _without_slow(method: Method, affordable: list[Method]) -> Method:

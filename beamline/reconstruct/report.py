@@ -114,7 +114,8 @@ def _footnotes(
         (True, f"Residual: {of_one if result.series is None else of_several}"),
         (
             True,
-            "Time of the whole command: from its start until volume and report are written, with reading and checks.",
+            "Total time, without loading the program: from opening the scan until volume and report are written, with "
+            "reading and checks.",
         ),
         (
             any("cnr" in values for values in metrics.values()),

@@ -32,7 +32,7 @@ METRICS = {
     "stray": Metric("Mass in empty regions", "", 4, "lower is better"),
     "air": Metric("Air level, in units of the FBP noise", "", 2, "nearer to 0 is better"),
     "seconds": Metric("Time of reconstruction", "s", 1, "lower is better"),
-    "elapsed": Metric("Time of the whole command", "s", 1, "lower is better"),
+    "elapsed": Metric("Total time, without loading the program", "s", 1, "lower is better"),
 }
 
 

@@ -11,7 +11,7 @@ import pytest
 
 import recon
 from beamline.core import installed
-from beamline.core.errors import exit_code, is_defect, user_message
+from beamline.core.errors import INTERRUPTED, exit_code, is_defect, user_message
 from recon.base.registry import LibraryError, loaded
 
 ROOT = Path(__file__).parents[3]
@@ -127,6 +127,15 @@ def test_a_file_of_the_user_by_the_name_of_a_library(name: str, said: str, tmp_p
     done = run(command, tmp_path)
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
     assert said in done.stderr and str(file) in done.stderr and "rename that file or folder" in done.stderr
+
+
+def test_ctrl_c_while_a_library_is_loaded_is_no_broken_library(tmp_path: Path) -> None:
+    (tmp_path / "click").mkdir()
+    (tmp_path / "click" / "__init__.py").write_text("raise KeyboardInterrupt", encoding="utf-8")
+    command = tmp_path / "beamline"
+    command.write_text("from beamline.cli.main import run\nrun()\n", encoding="utf-8")
+    done = run(command, tmp_path)
+    assert (done.returncode, done.stderr) == (INTERRUPTED, "beamline: interrupted\n")
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -60,7 +61,9 @@ def test_the_slowest_is_left_out_until_the_choice_ends_in_time(
     method, words = in_budget(Auto(), budget, views, Grid.matching(views), SteppedClock(0.0, 0.0), warned.append)
     assert [each.name for each in method.alternatives] == left
     assert [f"about {0.5 * late:.3g} s after this limit" in said for said in warned] == [True] * late
-    assert all((f"{name} would take about" in words) == (name not in left) for name in SECONDS)
+    assert all((f"with {name}, tests and volume would take about" in words) == (name not in left) for name in SECONDS)
+    times = [float(each) for each in re.findall(r"volume would take about ([0-9.]+) s", words)]
+    assert all(each > budget for each in times) and words.endswith(f"; about {budget:.3g} s remained") is bool(times)
     assert words.startswith(f"{budget:.3g} s for {' or '.join(left)}")
 
 
@@ -92,7 +95,7 @@ def test_a_run_in_a_budget_is_that_of_the_methods_left(tmp_path: Path) -> None:
     (whole, _), (same, chosen), (short, too_few) = volumes
     np.testing.assert_array_equal(whole.volume.data, same.volume.data)
     assert same.parameters["budget"] == 1000 and "16.7 min for fbp or fista-tv" in chosen
-    assert short.method == "fbp" and "fista-tv would take about" in too_few
+    assert short.method == "fbp" and "with fista-tv, tests and volume would take about" in too_few
     assert any("0.001 s is too short for this scan" in str(event.data) for event in events)
 
 
