@@ -107,8 +107,8 @@ def growing_views(options: ReconOptions, channels: Channels, truth: F32 | None) 
     follower.snapshots.remove()
 
 
-def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: FollowTiming) -> ReconOptions:
-    """Wait for the end of a scan whose method needs all projections; returns the options for the finished scan.
+def _wait_for_the_end(options: ReconOptions, channels: Channels, timing: FollowTiming) -> None:
+    """Wait for the end of a scan whose method needs all projections.
 
     If the method uses a reference, pictures of the projections so far are drawn during the wait.
 
@@ -137,7 +137,6 @@ def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: Follow
         if drawn is not None:
             message = "The picture now shows slices from all projections of the scan"
             channels.sink(StateEntered(ALL_SHOWN, message, time=channels.clock.now()))
-    return replace(options, follow=None)
 
 
 def _compile(picture: Path, channels: Channels, timing: FollowTiming) -> None:
@@ -209,11 +208,14 @@ def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_st
 
 @contextmanager
 def finished_views(options: ReconOptions, channels: Channels, truth: F32 | None) -> Iterator[Job]:
-    """The job of a finished scan, with compiled kernels. Finished slabs are kept if the block fails.
+    """The job of a finished scan, with compiled kernels. A running scan is awaited first. Finished slabs are kept if
+    the block fails.
 
     Raises:
         ConfigError, DataError: there are too few projections, or too little memory or disk space.
     """
+    if options.follow is not None:
+        _wait_for_the_end(options, channels, options.follow)
     sink, clock, warn, phases = channels.sink, channels.clock, channels.warn, channels.phases
     phases.enter("opening the scan")
     with options.source.open() as source:
@@ -315,9 +317,7 @@ def reconstruct_file(
             picture = {"picture": options.target.live_picture}
             sink(StateEntered("ready", shown, picture, time=clock.now()))
         options = with_reference(options, options.reference, first, sink, clock)
-    if options.follow is not None and not options.streams:
-        options = _when_it_has_ended(options, channels, options.follow)
-    views_of = finished_views if options.follow is None else growing_views
+    views_of = growing_views if options.follow is not None and options.streams else finished_views
     with views_of(options, channels, truth) as job:
         return _reconstructed(job)  # keeps no voxels: Windows does not remove a file that is mapped
 
