@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,21 +22,20 @@ from beamline.core.text import size
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepare import HELD_OUT_VIEWS, DiskBuffer, prepare_projections, require_usable
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.selection import SelectedScan, check_axis
+from beamline.projections.selection import SelectedScan, Selection, check_axis
 from beamline.reconstruct.combinations import contradiction
 from beamline.reconstruct.memory import (
     ReconMemory,
+    allowed_memory,
     cluster,
     local_workers,
-    memory_of,
     recon_memory_of,
+    refuse_several,
     refuse_smallest,
     refuse_whole,
 )
-from beamline.reconstruct.options import (
-    ReconOptions,
-)
-from beamline.reconstruct.region import Region, locate
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.region import AroundSample, Region, locate
 from beamline.reconstruct.run import refuse_impossible, refuse_views
 from beamline.reconstruct.truth import read_truth
 from beamline.storage.disk_file import scratch_array
@@ -46,6 +46,7 @@ from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import Clock
 from recon.base.arrays import F64, I64
 from recon.base.geometry import Geometry
+from recon.base.method import Method
 from recon.base.slabs import Slab, slabs_of
 from recon.base.views import parse_views
 from recon.base.volume import Grid
@@ -88,23 +89,25 @@ def planned(scan: SelectedScan, options: ReconOptions, needs: ReconMemory) -> Re
         DataError: the smallest slab does not fit, a cone-beam volume does not fit in one piece, or there are slabs of
             an earlier call.
     """
-    allowed, at_once, source = memory_of(options), needs.at_once, scan.source
-    _refuse_views(source, options, needs.geometry)
-    if options.selection.axis_col is not None or source.axis_col is not None or needs.geometry.is_cone:
-        _refuse_region(options, needs.geometry)
+    allowed, at_once = allowed_memory(options.memory, options.cluster), needs.at_once
+    source, selection = scan.source, scan.selection
+    _refuse_views(source.path, needs.method, needs.geometry, bars=needs.bars)
+    if selection.axis_col is not None or source.axis_col is not None or needs.geometry.is_cone:
+        _refuse_region(options.region, selection, needs.geometry)
     if at_once <= allowed and options.partial is None:
         return _plan(options, needs, allowed)
     if options.partial is None:
         options.target.refuse_partial()
-    if options.method.volumes == 1 and scan.selection.cone is not None:
+    if needs.method.volumes == 1 and selection.cone is not None:
         raise DataError(
-            f"{source.path}: {options.method.name} would need {size(at_once)} of memory, but {size(allowed)} is "
+            f"{source.path}: {needs.method.name} would need {size(at_once)} of memory, but {size(allowed)} is "
             "allowed, and a cone-beam volume cannot be made in slabs. Use more --memory, --bin 2, or fewer --rows."
         )
-    refuse_whole(scan, options, needs, allowed)
-    turned = scan.selection.step(TiltAndLens).of(scan) is not None
+    refuse_several(needs, allowed)
+    refuse_whole(scan, needs, allowed, checkpoints=options.checkpoints.wanted)
+    turned = selection.step(TiltAndLens).of(scan) is not None
     # whether other weights are needed is not known yet
-    needs = replace(needs, weighted=turned and options.method.weighs)
+    needs = replace(needs, weighted=turned and needs.method.weighs)
     return _in_slabs(source, options, needs, allowed)
 
 
@@ -148,16 +151,16 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
     return _plan(options, needs, plan.allowed)
 
 
-def refuse_geometry(scan: SelectedScan, options: ReconOptions, plan: ReconPlan, geometry: Geometry) -> None:
+def refuse_geometry(
+    scan: SelectedScan, region: Region | AroundSample | None, plan: ReconPlan, geometry: Geometry
+) -> None:
     """Raise DataError or ConfigError if the geometry of all projections, with the known axis, does not allow the
     reconstruction.
     """
-    _refuse_views(scan.source, options, geometry)
-    _refuse_region(options, geometry)
-    if options.method.volumes > 1:
-        needs = ReconMemory(options.method, geometry, 0, True)
-        if needs.at_once > plan.allowed:
-            refuse_whole(scan, options, needs, plan.allowed)
+    method = plan.needs.method
+    _refuse_views(scan.source.path, method, geometry, bars=plan.needs.bars)
+    _refuse_region(region, scan.selection, geometry)
+    refuse_several(ReconMemory(method, geometry, 0, True), plan.allowed)
     if plan.slabs and not geometry.is_straight:
         raise DataError(
             f"{scan.source.path}: use more --memory, --bin 2, or fewer --rows. The whole scan must be in memory, "
@@ -166,23 +169,22 @@ def refuse_geometry(scan: SelectedScan, options: ReconOptions, plan: ReconPlan, 
         )
 
 
-def _refuse_views(source: ScanSource, options: ReconOptions, geometry: Geometry) -> None:
-    """Raise DataError or ConfigError if there are too few views."""
-    volumes, least = options.method.volumes, options.method.least_views
+def _refuse_views(path: Path, method: Method, geometry: Geometry, *, bars: bool) -> None:
+    """Raise DataError or ConfigError if there are too few views for the method, or for its error bars."""
+    volumes, least = method.volumes, method.least_views
     if volumes * least > geometry.n_views:
         raise DataError(
-            f"{source.path} cannot be reconstructed by {options.method.name}: {volumes} volumes from "
-            f"{geometry.n_views} projections are too many, because each volume needs at least {least} "
-            "projections. Nothing was written."
+            f"{path} cannot be reconstructed by {method.name}: {volumes} volumes from {geometry.n_views} projections "
+            f"are too many, because each volume needs at least {least} projections. Nothing was written."
         )
-    if options.uncertainty:
-        refuse_views(options.method_for(geometry), geometry)
+    if bars:
+        refuse_views(method, geometry)
 
 
-def _refuse_region(options: ReconOptions, geometry: Geometry) -> None:
+def _refuse_region(region: Region | AroundSample | None, selection: Selection, geometry: Geometry) -> None:
     """Raise ConfigError if the region lies outside the volume."""
-    if isinstance(options.region, Region):
-        locate(options.region, options.selection, geometry)
+    if isinstance(region, Region):
+        locate(region, selection, geometry)
 
 
 def _in_slabs(source: ScanSource, options: ReconOptions, needs: ReconMemory, allowed: int) -> ReconPlan:
@@ -249,7 +251,7 @@ def prepare_within(
         buffer = DiskBuffer(scratch_array(options.target.output.parent, shape), batch)
 
     prepared = prepare_projections(
-        scan, warn, buffer, lambda geometry: refuse_geometry(scan, options, plan, geometry), phases
+        scan, warn, buffer, lambda geometry: refuse_geometry(scan, options.region, plan, geometry), phases
     )
     if "times" in options.method.takes:
         prepared = replace(prepared, times=times_of(scan.source, prepared.ids, warn))
@@ -343,7 +345,7 @@ def _refuse_file(source: ScanSource, options: ReconOptions) -> None:
             f"{source.path} is not finished. {next_step(source.path)} To use the {len(source.table)} frames recorded "
             "so far, add --unfinished. Nothing was written."
         )
-    if source.unpack_bytes > (allowed := memory_of(options)):
+    if source.unpack_bytes > (allowed := allowed_memory(options.memory, options.cluster)):
         needed_mb = math.ceil(source.unpack_bytes / 1e6)
         raise DataError(
             f"{source.path} is stored in chunks, and unpacking one chunk needs {size(source.unpack_bytes)} of "
