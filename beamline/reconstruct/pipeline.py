@@ -36,9 +36,10 @@ from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.live_reference import ReferencePictures
 from beamline.reconstruct.live_states import LiveScan
 from beamline.reconstruct.options import FollowTiming, ReconOptions
-from beamline.reconstruct.plan import ReconPlan, prepare_within, refuse_before_reading
+from beamline.reconstruct.plan import ReconPlan, prepare_within
 from beamline.reconstruct.record import partly_seen_warning, write_result
 from beamline.reconstruct.reference import with_reference
+from beamline.reconstruct.refusals import refuse_before_reading
 from beamline.reconstruct.region import Region, locate
 from beamline.reconstruct.run import fit_within, refuse_views, warnings_shown
 from beamline.reconstruct.scan_facts import MadeVolume, ReportContext, ScanFacts, facts_of
@@ -117,13 +118,8 @@ def _wait_for_the_end(options: ReconOptions, channels: Channels, timing: FollowT
         KeyboardInterrupt: stopped before the end of the scan; nothing was written.
     """
     with channels.stop_scope() as should_stop, _open(options.source, channels, timing) as source:
-        channels.sink(
-            StateEntered(
-                "waiting",
-                f"{options.method.name} needs all projections: the reconstruction starts when the scan has ended",
-                time=channels.clock.now(),
-            )
-        )
+        message = f"{options.method.name} needs all projections: the reconstruction starts when the scan has ended"
+        channels.sink(StateEntered("waiting", message, time=channels.clock.now()))
         drawn = None
         if options.reference is not None:
             views = FollowedViews(select(source, options.selection))
@@ -269,8 +265,8 @@ def _for_method(
         )
     if options.method.stops_early and not prepared.lines.held_out.size:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
-        n, total = prepared.n_used, prepared.origin.n_projections
-        n_held_out = total - n
+        total = prepared.origin.n_projections
+        n_held_out = total - prepared.n_used
         message = f"{n_held_out} of {total} projections are held out to decide when to stop"
         channels.sink(StateEntered("held_out", message, time=channels.clock.now()))
     options.target.require_room(plan.output, plan.scratch - plan.line_integrals)  # line integrals are stored already
@@ -283,8 +279,8 @@ def _announce(options: ReconOptions, prepared: PreparedProjections, channels: Ch
     corrections_done({name: done.sentence for name, done in origin.done.items() if not done.warned}, sink, clock)
     views, confident = prepared.geometry, None if origin.axis is None else origin.axis.confident
     more = {"n_projections": origin.n_projections, "detector": views.detector_shape, "axis_confident": confident}
-    path, method = options.source.path, options.method.name
-    sink(ReconStarted(path, method, views.n_views, origin.axis_col, more=more, time=clock.now()))
+    path, name = options.source.path, options.method.name
+    sink(ReconStarted(path, name, views.n_views, origin.axis_col, more=more, time=clock.now()))
 
 
 def reconstruct_file(

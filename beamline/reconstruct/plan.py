@@ -10,25 +10,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from beamline.core.durations import Phases
-from beamline.core.errors import ConfigError, DataError
+from beamline.core.errors import DataError
 from beamline.core.events import Sink, StateEntered
-from beamline.core.files import refuse_not_utf8
 from beamline.core.machine import Need
 from beamline.core.sinks import Warn
 from beamline.core.text import size
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepare import HELD_OUT_VIEWS, DiskBuffer, prepare_projections, require_usable
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.selection import SelectedScan, Selection, check_axis
-from beamline.reconstruct.combinations import contradiction
+from beamline.projections.selection import SelectedScan, Selection
 from beamline.reconstruct.memory import (
     ReconMemory,
     allowed_memory,
-    cluster,
-    local_workers,
     recon_memory_of,
     refuse_several,
     refuse_smallest,
@@ -36,21 +31,16 @@ from beamline.reconstruct.memory import (
 )
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.region import AroundSample, Region, locate
-from beamline.reconstruct.run import refuse_impossible, refuse_views
-from beamline.reconstruct.truth import read_truth
+from beamline.reconstruct.run import refuse_views
 from beamline.storage.disk_file import scratch_array
-from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.writers.partial_volume import slabs_of_partial
-from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import Clock
 from recon.base.arrays import F64, I64
 from recon.base.geometry import Geometry
 from recon.base.method import Method
 from recon.base.slabs import Slab, slabs_of
-from recon.base.views import parse_views
 from recon.base.volume import Grid
-from recon.splatting.backend import backend_for
 from recon.voxels.beyond_field import whole_reach
 
 _BATCH = 0.25  # fraction of the memory for projections during correction
@@ -273,90 +263,3 @@ def times_of(source: ScanSource, view_ids: I64, warn: Warn) -> F64:
         "order of the file."
     )
     return np.asarray(view_ids * float(period), np.float64)
-
-
-def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
-    """Check all that can be checked without reading a frame.
-
-    Returns:
-        The ground truth [z, y, x] with which the volume is compared; None without a ground truth.
-
-    Raises:
-        ConfigError, DataError: a check failed; nothing was written.
-    """
-    if options.follow is not None:
-        _refuse_unfollowed(options)
-    for path in (options.source.path, options.target.output):
-        refuse_not_utf8(path)
-    options.target.refuse_existing()
-    options.checkpoints.refuse_existing()
-    _check_device(options.device)
-    _refuse_contradictions(options)
-    if options.uncertainty:
-        refuse_impossible(options)
-    if options.cluster is not None:
-        workers = cluster(options.cluster)
-        if not local_workers(options.cluster):
-            with workers:  # raises ConfigError if a scheduler does not have them
-                pass
-    truth = None if options.truth is None else read_truth(options.truth)
-    if options.follow is None:
-        with options.source.open() as source:
-            _refuse_file(source, options)
-            if options.selection.axis_col is not None:
-                check_axis(source, options.selection.axis_col)
-    return truth
-
-
-def _refuse_contradictions(options: ReconOptions) -> None:
-    """Raise ConfigError for options that exclude each other, and for a file that cannot contain several volumes."""
-    if (pair := contradiction(options.given)) is not None:
-        raise ConfigError(f"{pair.name} cannot be combined with {pair.other}: {pair.why}. Nothing was computed.")
-    target = options.target
-    if options.method.volumes > 1 and target.written and target.output.suffix.lower() not in SUFFIXES:
-        raise ConfigError(
-            f"-o {target.output}: several volumes can only be written to HDF5. Use a name that ends in .h5."
-        )
-
-
-def _refuse_unfollowed(options: ReconOptions) -> None:
-    """Raise ConfigError for a method, or a choice of views, that cannot be used for a growing scan."""
-    if not options.streams:
-        return
-    method, views = options.streaming, options.selection.views
-    if not (views == "all" or views.startswith("every:")) or method.steps is not None:
-        raise ConfigError(
-            "Leave out --steps. Also leave out --views, unless it is every:K. The reason: --follow uses the "
-            "projections in the order in which "
-            "they are recorded, and fits for --seconds after the end of the scan."
-        )
-    try:
-        parse_views(views, [0.0])
-    except ValueError as error:
-        raise ConfigError(f"{error}. Nothing was written.") from error
-
-
-def _refuse_file(source: ScanSource, options: ReconOptions) -> None:
-    """Raise DataError in two cases: the scan is not finished and the options do not allow this, or a chunk of its file
-    does not fit into the memory when it is unpacked.
-    """
-    if not (source.finished or options.unfinished):
-        raise DataError(
-            f"{source.path} is not finished. {next_step(source.path)} To use the {len(source.table)} frames recorded "
-            "so far, add --unfinished. Nothing was written."
-        )
-    if source.unpack_bytes > (allowed := allowed_memory(options.memory, options.cluster)):
-        needed_mb = math.ceil(source.unpack_bytes / 1e6)
-        raise DataError(
-            f"{source.path} is stored in chunks, and unpacking one chunk needs {size(source.unpack_bytes)} of "
-            f"memory, but {size(allowed)} is allowed. Use --memory {needed_mb}M if the "
-            "computer has this much memory, or copy the file with one frame in each chunk. Nothing was read."
-        )
-
-
-def _check_device(device: str) -> None:
-    """Raise ConfigError if methods cannot compute on the device."""
-    try:
-        backend_for(device)
-    except (ImportError, RuntimeError, ValueError) as error:
-        raise ConfigError(f"--device {device}: {error}. Leave out --device to compute on the CPU.") from error
