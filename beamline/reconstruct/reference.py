@@ -60,7 +60,9 @@ def with_reference(
         if _too_few(options):
             return options  # the method reports this, and does not use a reference
         if not path.exists():
-            _write_volume_of(scan, path, options, reconstruct, sink, clock)
+            source, target = SourceOptions(scan), OutputPaths(path, None)
+            first = ReconOptions(source, target, Selection(), Auto(), seed=options.seed, memory=options.memory)
+            _reconstruct_first(first, reconstruct, sink, clock)
         kind = NXtomoproc()
     with kind.open(path) as record:
         if scan is not None and not same_file(Path(record.raw_file), scan):
@@ -81,29 +83,23 @@ def with_reference(
     return replace(options, method=method)
 
 
-def _write_volume_of(
-    scan: Path,
-    volume_path: Path,
-    options: ReconOptions,
-    reconstruct: Callable[[ReconOptions, Sink], ReconRecord],
-    sink: Sink,
-    clock: Clock,
+def _reconstruct_first(
+    first: ReconOptions, reconstruct: Callable[[ReconOptions, Sink], ReconRecord], sink: Sink, clock: Clock
 ) -> None:
-    """Reconstruct the scan of the reference, with the seed and the memory of `options`, and write its volume.
+    """Reconstruct the scan of the reference with the options `first`, and write its volume.
 
     Raises:
         ScanStopped: the reconstruction was stopped; the volume was removed.
     """
-    message = f"The reference {scan.name} is a scan: it is reconstructed first, into {volume_path.name}"
+    name, volume_path = Path(first.source.path).name, first.target.output
+    message = f"The reference {name} is a scan: it is reconstructed first, into {volume_path.name}"
     sink(StateEntered("reference", message, {"reference": volume_path}, time=clock.now()))
-    target, source = OutputPaths(volume_path, None), SourceOptions(scan)
-    first = ReconOptions(source, target, Selection(), Auto(), seed=options.seed, memory=options.memory)
     record = reconstruct(first, lambda event: None if isinstance(event, VolumeDone) else sink(event))
     if record.ended_early:  # a reference that ended early is poor, and later calls would use it
         volume_path.unlink()
         raise ScanStopped(
-            f"The reconstruction of the reference {scan.name} was stopped, so its volume {volume_path} was removed. "
-            "The later scan was not reconstructed."
+            f"The reconstruction of the reference {name} was stopped, so its volume {volume_path} was removed. The "
+            "later scan was not reconstructed."
         )
 
 
