@@ -15,7 +15,8 @@ from beamline.projections.selection import SelectedScan, check_axis
 from beamline.projections.views import select
 from beamline.reconstruct.memory import recon_memory_of
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.plan import planned, refuse_before_reading
+from beamline.reconstruct.plan import planned
+from beamline.reconstruct.refusals import refuse_before_reading
 from beamline.reconstruct.truth import fit_truth
 from recon.assess.time_model import duration_text
 from recon.base.geometry import Geometry

@@ -28,7 +28,7 @@ from beamline.reconstruct.run import deviation_by_slabs, deviation_of, run_on, w
 from beamline.reconstruct.scan_facts import ScanFacts
 from beamline.reconstruct.slab_run import RunMethod, SlabWorkers, in_slabs
 from drivers.base.clock import Clock
-from recon.base.arrays import F64
+from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions, Stop
 from recon.base.geometry import Geometry
 from recon.base.method import (
@@ -125,6 +125,7 @@ class Job:
         facts: reads the facts of the scan, after the volume is done.
         stopping: context in which the work can be stopped with the volume reached so far.
         stop: the stop request of the context that is open now.
+        truth: the ground truth [z, y, x] with which the volume is compared; None: there is no ground truth.
         slabs: the slabs in which the volume is reconstructed; empty: in one piece.
         final_fit: last part of a fit that has grown with the projections; None: the method of the options is used.
         leaves: function that returns True if this number of seconds is left before the report.
@@ -136,6 +137,7 @@ class Job:
     facts: Callable[[], ScanFacts]
     stopping: StopScope
     stop: Stop = field(default_factory=Stop)
+    truth: F32 | None = None
     slabs: Sequence[Slab] = ()
     region: RegionOfRows | None = None
     final_fit: FinalFit | None = None

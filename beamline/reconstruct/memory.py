@@ -169,37 +169,46 @@ def recon_memory_of(scan: SelectedScan, options: ReconOptions) -> ReconMemory:
     )
 
 
-def memory_of(options: ReconOptions) -> int:
-    """Memory in bytes that this process may use, and that each worker on this computer or in the Slurm job may use."""
-    if options.memory is not None:
-        return options.memory
+def allowed_memory(memory: int | None, workers: str | None) -> int:
+    """Memory in bytes that this process may use, and that each worker on this computer or in the Slurm job may use.
+
+    Args:
+        memory: bytes that the user allows; None: a share of the free memory.
+        workers: the workers that reconstruct slabs, in the form of `--cluster`; None: there are none.
+    """
+    if memory is not None:
+        return memory
     free = free_memory()
-    return round(SHARE * free / (1 + local_workers(options.cluster)))
+    return round(SHARE * free / (1 + local_workers(workers)))
 
 
-def refuse_whole(scan: SelectedScan, options: ReconOptions, needs: ReconMemory, memory: int) -> None:
-    """Raise ConfigError if the method or an option needs everything in memory."""
-    if options.method.volumes > 1:
+def refuse_several(needs: ReconMemory, memory: int) -> None:
+    """Raise ConfigError if several volumes do not fit into the memory together."""
+    n_volumes = needs.method.volumes
+    if n_volumes > 1 and needs.at_once > memory:
         fewer = int(needs.rows * memory / needs.at_once)
         rows = f"--rows with {count(fewer, 'row')} or fewer at a time, or " if fewer else ""
         raise ConfigError(
-            f"Use {rows}--bin, because a time series cannot be reconstructed in slabs: {options.method.volumes} "
-            f"volumes, each of {Grid.matching(needs.geometry).shape} voxels, need {size(needs.at_once)} of "
-            f"memory, but {size(memory)} is allowed. Nothing was written."
+            f"Use {rows}--bin, because a time series cannot be reconstructed in slabs: {n_volumes} volumes, each of "
+            f"{Grid.matching(needs.geometry).shape} voxels, need {size(needs.at_once)} of memory, but {size(memory)} "
+            "is allowed. Nothing was written."
         )
-    poses = stated_poses(scan)
+
+
+def refuse_whole(scan: SelectedScan, needs: ReconMemory, memory: int, *, checkpoints: bool) -> None:
+    """Raise ConfigError if the method or an option needs everything in memory. checkpoints: True if the user gave a
+    checkpoint to write or to resume from.
+    """
+    poses, selection = stated_poses(scan), scan.selection
     whole = {
-        **{
-            f"{step.requested_by} with roll or tilt": step.may_roll_or_tilt
-            for step in geometry_steps(options.selection)
-        },
+        **{f"{step.requested_by} with roll or tilt": step.may_roll_or_tilt for step in geometry_steps(selection)},
         "--poses with roll, tilt or vectors": poses is not None and poses.leans,
-        "--checkpoint and --resume": options.checkpoints.wanted,
-        "--early-stop": options.method.stops_early,
+        "--checkpoint and --resume": checkpoints,
+        "--early-stop": needs.method.stops_early,
     }
     for option, used in whole.items():
         if used:
-            larger_bin = 2 * options.selection.binning
+            larger_bin = 2 * selection.binning
             raise ConfigError(
                 f"{option} needs the whole scan in memory: {scan.source.path} needs {size(needs.at_once)}, but "
                 f"{size(memory)} is allowed. Leave out this option, or use --bin {larger_bin} "

@@ -36,9 +36,10 @@ from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.live_reference import ReferencePictures
 from beamline.reconstruct.live_states import LiveScan
 from beamline.reconstruct.options import FollowTiming, ReconOptions
-from beamline.reconstruct.plan import ReconPlan, prepare_within, refuse_before_reading
+from beamline.reconstruct.plan import ReconPlan, prepare_within
 from beamline.reconstruct.record import partly_seen_warning, write_result
 from beamline.reconstruct.reference import with_reference
+from beamline.reconstruct.refusals import refuse_before_reading
 from beamline.reconstruct.region import Region, locate
 from beamline.reconstruct.run import fit_within, refuse_views, warnings_shown
 from beamline.reconstruct.scan_facts import MadeVolume, ReportContext, ScanFacts, facts_of
@@ -50,6 +51,7 @@ from beamline.storage.readers.open import NotReadyError, ScanSource, SourceOptio
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writer_lock import WriterWatch
 from drivers.base.clock import Clock
+from recon.base.arrays import F32
 from recon.base.decisions import Decisions, Stop
 from recon.base.volume import Grid
 from recon.splatting.r2 import R2
@@ -60,7 +62,7 @@ _HELD_OUT_ONE_IN = 10  # every tenth projection is held out for --early-stop
 
 
 @contextmanager
-def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
+def growing_views(options: ReconOptions, channels: Channels, truth: F32 | None) -> Iterator[Job]:
     """Follow a running scan to its last projection with a growing fit; yields the job that makes its volume.
 
     Intermediate volumes are in `<output>.snapshot.h5`, their pictures in `<output>.live.png`. If the block fails, the
@@ -72,10 +74,8 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
     """
     timing, sink, clock = options.follow, channels.sink, channels.clock
     assert timing is not None
-    with suppress(NotReadyError):
-        options.source.open(
-            follow=True
-        ).close()  # raises an error for a file that is not a scan, before anything is compiled
+    with suppress(NotReadyError):  # an error for a file that is not a scan comes before anything is compiled
+        options.source.open(follow=True).close()
     _compile(options.target.live_picture, channels, timing)
     with channels.stop_scope() as should_stop:
         with _open(options.source, channels, timing) as source:
@@ -102,12 +102,14 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
         phases.enter("final fit")
         final_fit = follower.final_fit(last, options.streaming.seconds or MOST_SECONDS, timing.snapshot)
         channels = replace(channels, phases=phases)
-        yield Job(options, channels, last.prepared, facts, lambda: nullcontext(should_stop), final_fit=final_fit)
+        yield Job(
+            options, channels, last.prepared, facts, lambda: nullcontext(should_stop), truth=truth, final_fit=final_fit
+        )
     follower.snapshots.remove()
 
 
-def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: FollowTiming) -> ReconOptions:
-    """Wait for the end of a scan whose method needs all projections; returns the options for the finished scan.
+def _wait_for_the_end(options: ReconOptions, channels: Channels, timing: FollowTiming) -> None:
+    """Wait for the end of a scan whose method needs all projections.
 
     If the method uses a reference, pictures of the projections so far are drawn during the wait.
 
@@ -116,13 +118,8 @@ def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: Follow
         KeyboardInterrupt: stopped before the end of the scan; nothing was written.
     """
     with channels.stop_scope() as should_stop, _open(options.source, channels, timing) as source:
-        channels.sink(
-            StateEntered(
-                "waiting",
-                f"{options.method.name} needs all projections: the reconstruction starts when the scan has ended",
-                time=channels.clock.now(),
-            )
-        )
+        message = f"{options.method.name} needs all projections: the reconstruction starts when the scan has ended"
+        channels.sink(StateEntered("waiting", message, time=channels.clock.now()))
         drawn = None
         if options.reference is not None:
             views = FollowedViews(select(source, options.selection))
@@ -136,7 +133,6 @@ def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: Follow
         if drawn is not None:
             message = "The picture now shows slices from all projections of the scan"
             channels.sink(StateEntered(ALL_SHOWN, message, time=channels.clock.now()))
-    return replace(options, follow=None)
 
 
 def _compile(picture: Path, channels: Channels, timing: FollowTiming) -> None:
@@ -207,12 +203,15 @@ def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_st
 
 
 @contextmanager
-def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
-    """The job of a finished scan, with compiled kernels. Finished slabs are kept if the block fails.
+def finished_views(options: ReconOptions, channels: Channels, truth: F32 | None) -> Iterator[Job]:
+    """The job of a finished scan, with compiled kernels. A running scan is awaited first. Finished slabs are kept if
+    the block fails.
 
     Raises:
         ConfigError, DataError: there are too few projections, or too little memory or disk space.
     """
+    if options.follow is not None:
+        _wait_for_the_end(options, channels, options.follow)
     sink, clock, warn, phases = channels.sink, channels.clock, channels.warn, channels.phases
     phases.enter("opening the scan")
     with options.source.open() as source:
@@ -241,15 +240,9 @@ def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
             )
             options = replace(options, method=method)
         yield Job(
-            options,
-            channels,
-            prepared,
-            lambda: facts,
-            stopping,
-            slabs=plan.slabs,
-            region=region,
-            leaves=before_report.leaves,
-        )
+            options, channels, prepared, lambda: facts, stopping,
+            truth=truth, slabs=plan.slabs, region=region, leaves=before_report.leaves,
+        )  # fmt: skip
 
 
 def _for_method(
@@ -272,8 +265,8 @@ def _for_method(
         )
     if options.method.stops_early and not prepared.lines.held_out.size:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
-        n, total = prepared.n_used, prepared.origin.n_projections
-        n_held_out = total - n
+        total = prepared.origin.n_projections
+        n_held_out = total - prepared.n_used
         message = f"{n_held_out} of {total} projections are held out to decide when to stop"
         channels.sink(StateEntered("held_out", message, time=channels.clock.now()))
     options.target.require_room(plan.output, plan.scratch - plan.line_integrals)  # line integrals are stored already
@@ -286,11 +279,8 @@ def _announce(options: ReconOptions, prepared: PreparedProjections, channels: Ch
     corrections_done({name: done.sentence for name, done in origin.done.items() if not done.warned}, sink, clock)
     views, confident = prepared.geometry, None if origin.axis is None else origin.axis.confident
     more = {"n_projections": origin.n_projections, "detector": views.detector_shape, "axis_confident": confident}
-    sink(
-        ReconStarted(
-            options.source.path, options.method.name, views.n_views, origin.axis_col, more=more, time=clock.now()
-        )
-    )
+    path, name = options.source.path, options.method.name
+    sink(ReconStarted(path, name, views.n_views, origin.axis_col, more=more, time=clock.now()))
 
 
 def reconstruct_file(
@@ -315,7 +305,7 @@ def reconstruct_file(
     channels = Channels(
         sink, clock, Warnings(sink, clock), Phases(sink, clock), stop_scope, clock.now(), time.process_time()
     )
-    truth_given = refuse_before_reading(options)
+    truth = refuse_before_reading(options)
     if options.reference is not None:
         first = partial(reconstruct_file, clock=clock, stop_scope=stop_scope)
         if options.follow is not None:  # a running scan waits for this event
@@ -323,28 +313,34 @@ def reconstruct_file(
             picture = {"picture": options.target.live_picture}
             sink(StateEntered("ready", shown, picture, time=clock.now()))
         options = with_reference(options, options.reference, first, sink, clock)
-    if options.follow is not None and not options.streams:
-        options = _when_it_has_ended(options, channels, options.follow)
-    views_of = finished_views if options.follow is None else growing_views
-    with views_of(options, channels) as job:
-        if truth_given is not None:  # checked before the work starts
-            fit_truth(truth_given, Grid.matching(job.prepared.geometry), options.selection.binning)
-        decided = Decisions(options.seed)
-        with job.stopping() as stopped, warnings_shown(channels.warn):
-            result, prepared = volume_of(replace(job, stop=Stop(stopped)), decided)
-        if options.uncertainty:
-            job.channels.phases.enter("error bars")
-            with stop_scope() as stopped, warnings_shown(channels.warn):
-                result = with_error_bars(replace(job, stop=Stop(stopped)), result, decided)
-        joined = round(prepared.geometry.pixel_pitch / job.prepared.geometry.pixel_pitch)
-        selection = replace(job.options.selection, binning=options.selection.binning * joined)
-        truth = None if truth_given is None else fit_truth(truth_given, result.volume.grid, selection.binning)
-        context = ReportContext(
-            job.facts(), selection, options.command, options.seed, channels.warn.messages, channels.started,
-            recipe=options.recipe, region=job.region, phases=job.channels.phases, leaves=job.leaves,
-            filter=options.filter,
-        )  # fmt: skip
-        with job.stopping():  # the volume is complete: the first signal no longer discards it
-            record = write_result(MadeVolume(result, prepared, truth, options.target, context), sink, clock)
-        del result, prepared  # Windows does not remove a file that is mapped
-    return record
+    views_of = growing_views if options.follow is not None and options.streams else finished_views
+    with views_of(options, channels, truth) as job:
+        return _reconstructed(job)  # keeps no voxels: Windows does not remove a file that is mapped
+
+
+def _reconstructed(job: Job) -> ReconRecord:
+    """Reconstruct the volume of a job, check the volume and write its files. Returns the record of the volume.
+
+    Raises:
+        ConfigError: the shape of the ground truth does not fit the volume.
+        DataError: the method cannot use the projections, or the volume could not be written.
+    """
+    options, channels, truth_given = job.options, job.channels, job.truth
+    if truth_given is not None:  # checked before the work starts
+        fit_truth(truth_given, Grid.matching(job.prepared.geometry), options.selection.binning)
+    decided = Decisions(options.seed)
+    with job.stopping() as stopped, warnings_shown(channels.warn):
+        result, prepared = volume_of(replace(job, stop=Stop(stopped)), decided)
+    if options.uncertainty:
+        channels.phases.enter("error bars")
+        with channels.stop_scope() as stopped, warnings_shown(channels.warn):
+            result = with_error_bars(replace(job, stop=Stop(stopped)), result, decided)
+    joined = round(prepared.geometry.pixel_pitch / job.prepared.geometry.pixel_pitch)
+    selection = replace(options.selection, binning=options.selection.binning * joined)
+    truth = None if truth_given is None else fit_truth(truth_given, result.volume.grid, selection.binning)
+    context = ReportContext(
+        job.facts(), selection, options.command, options.seed, channels.warn.messages, channels.started,
+        recipe=options.recipe, region=job.region, phases=channels.phases, leaves=job.leaves, filter=options.filter,
+    )  # fmt: skip
+    with job.stopping():  # the volume is complete: the first signal no longer discards it
+        return write_result(MadeVolume(result, prepared, truth, options.target, context), channels.sink, channels.clock)

@@ -7,49 +7,40 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from beamline.core.durations import Phases
-from beamline.core.errors import ConfigError, DataError
+from beamline.core.errors import DataError
 from beamline.core.events import Sink, StateEntered
-from beamline.core.files import refuse_not_utf8
 from beamline.core.machine import Need
 from beamline.core.sinks import Warn
 from beamline.core.text import size
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepare import HELD_OUT_VIEWS, DiskBuffer, prepare_projections, require_usable
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.selection import SelectedScan, check_axis
-from beamline.reconstruct.combinations import contradiction
+from beamline.projections.selection import SelectedScan, Selection
 from beamline.reconstruct.memory import (
     ReconMemory,
-    cluster,
-    local_workers,
-    memory_of,
+    allowed_memory,
     recon_memory_of,
+    refuse_several,
     refuse_smallest,
     refuse_whole,
 )
-from beamline.reconstruct.options import (
-    ReconOptions,
-)
-from beamline.reconstruct.region import Region, locate
-from beamline.reconstruct.run import refuse_impossible, refuse_views
-from beamline.reconstruct.truth import read_truth
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.region import AroundSample, Region, locate
+from beamline.reconstruct.run import refuse_views
 from beamline.storage.disk_file import scratch_array
-from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.writers.partial_volume import slabs_of_partial
-from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import Clock
 from recon.base.arrays import F64, I64
 from recon.base.geometry import Geometry
+from recon.base.method import Method
 from recon.base.slabs import Slab, slabs_of
-from recon.base.views import parse_views
 from recon.base.volume import Grid
-from recon.splatting.backend import backend_for
 from recon.voxels.beyond_field import whole_reach
 
 _BATCH = 0.25  # fraction of the memory for projections during correction
@@ -88,23 +79,25 @@ def planned(scan: SelectedScan, options: ReconOptions, needs: ReconMemory) -> Re
         DataError: the smallest slab does not fit, a cone-beam volume does not fit in one piece, or there are slabs of
             an earlier call.
     """
-    allowed, at_once, source = memory_of(options), needs.at_once, scan.source
-    _refuse_views(source, options, needs.geometry)
-    if options.selection.axis_col is not None or source.axis_col is not None or needs.geometry.is_cone:
-        _refuse_region(options, needs.geometry)
+    allowed, at_once = allowed_memory(options.memory, options.cluster), needs.at_once
+    source, selection = scan.source, scan.selection
+    _refuse_views(source.path, needs.method, needs.geometry, bars=needs.bars)
+    if selection.axis_col is not None or source.axis_col is not None or needs.geometry.is_cone:
+        _refuse_region(options.region, selection, needs.geometry)
     if at_once <= allowed and options.partial is None:
         return _plan(options, needs, allowed)
     if options.partial is None:
         options.target.refuse_partial()
-    if options.method.volumes == 1 and scan.selection.cone is not None:
+    if needs.method.volumes == 1 and selection.cone is not None:
         raise DataError(
-            f"{source.path}: {options.method.name} would need {size(at_once)} of memory, but {size(allowed)} is "
+            f"{source.path}: {needs.method.name} would need {size(at_once)} of memory, but {size(allowed)} is "
             "allowed, and a cone-beam volume cannot be made in slabs. Use more --memory, --bin 2, or fewer --rows."
         )
-    refuse_whole(scan, options, needs, allowed)
-    turned = scan.selection.step(TiltAndLens).of(scan) is not None
+    refuse_several(needs, allowed)
+    refuse_whole(scan, needs, allowed, checkpoints=options.checkpoints.wanted)
+    turned = selection.step(TiltAndLens).of(scan) is not None
     # whether other weights are needed is not known yet
-    needs = replace(needs, weighted=turned and options.method.weighs)
+    needs = replace(needs, weighted=turned and needs.method.weighs)
     return _in_slabs(source, options, needs, allowed)
 
 
@@ -148,16 +141,16 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
     return _plan(options, needs, plan.allowed)
 
 
-def refuse_geometry(scan: SelectedScan, options: ReconOptions, plan: ReconPlan, geometry: Geometry) -> None:
+def refuse_geometry(
+    scan: SelectedScan, region: Region | AroundSample | None, plan: ReconPlan, geometry: Geometry
+) -> None:
     """Raise DataError or ConfigError if the geometry of all projections, with the known axis, does not allow the
     reconstruction.
     """
-    _refuse_views(scan.source, options, geometry)
-    _refuse_region(options, geometry)
-    if options.method.volumes > 1:
-        needs = ReconMemory(options.method, geometry, 0, True)
-        if needs.at_once > plan.allowed:
-            refuse_whole(scan, options, needs, plan.allowed)
+    method = plan.needs.method
+    _refuse_views(scan.source.path, method, geometry, bars=plan.needs.bars)
+    _refuse_region(region, scan.selection, geometry)
+    refuse_several(ReconMemory(method, geometry, 0, True), plan.allowed)
     if plan.slabs and not geometry.is_straight:
         raise DataError(
             f"{scan.source.path}: use more --memory, --bin 2, or fewer --rows. The whole scan must be in memory, "
@@ -166,23 +159,22 @@ def refuse_geometry(scan: SelectedScan, options: ReconOptions, plan: ReconPlan, 
         )
 
 
-def _refuse_views(source: ScanSource, options: ReconOptions, geometry: Geometry) -> None:
-    """Raise DataError or ConfigError if there are too few views."""
-    volumes, least = options.method.volumes, options.method.least_views
+def _refuse_views(path: Path, method: Method, geometry: Geometry, *, bars: bool) -> None:
+    """Raise DataError or ConfigError if there are too few views for the method, or for its error bars."""
+    volumes, least = method.volumes, method.least_views
     if volumes * least > geometry.n_views:
         raise DataError(
-            f"{source.path} cannot be reconstructed by {options.method.name}: {volumes} volumes from "
-            f"{geometry.n_views} projections are too many, because each volume needs at least {least} "
-            "projections. Nothing was written."
+            f"{path} cannot be reconstructed by {method.name}: {volumes} volumes from {geometry.n_views} projections "
+            f"are too many, because each volume needs at least {least} projections. Nothing was written."
         )
-    if options.uncertainty:
-        refuse_views(options.method_for(geometry), geometry)
+    if bars:
+        refuse_views(method, geometry)
 
 
-def _refuse_region(options: ReconOptions, geometry: Geometry) -> None:
+def _refuse_region(region: Region | AroundSample | None, selection: Selection, geometry: Geometry) -> None:
     """Raise ConfigError if the region lies outside the volume."""
-    if isinstance(options.region, Region):
-        locate(options.region, options.selection, geometry)
+    if isinstance(region, Region):
+        locate(region, selection, geometry)
 
 
 def _in_slabs(source: ScanSource, options: ReconOptions, needs: ReconMemory, allowed: int) -> ReconPlan:
@@ -249,7 +241,7 @@ def prepare_within(
         buffer = DiskBuffer(scratch_array(options.target.output.parent, shape), batch)
 
     prepared = prepare_projections(
-        scan, warn, buffer, lambda geometry: refuse_geometry(scan, options, plan, geometry), phases
+        scan, warn, buffer, lambda geometry: refuse_geometry(scan, options.region, plan, geometry), phases
     )
     if "times" in options.method.takes:
         prepared = replace(prepared, times=times_of(scan.source, prepared.ids, warn))
@@ -271,90 +263,3 @@ def times_of(source: ScanSource, view_ids: I64, warn: Warn) -> F64:
         "order of the file."
     )
     return np.asarray(view_ids * float(period), np.float64)
-
-
-def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
-    """Check all that can be checked without reading a frame.
-
-    Returns:
-        The ground truth [z, y, x] with which the volume is compared; None without a ground truth.
-
-    Raises:
-        ConfigError, DataError: a check failed; nothing was written.
-    """
-    if options.follow is not None:
-        _refuse_unfollowed(options)
-    for path in (options.source.path, options.target.output):
-        refuse_not_utf8(path)
-    options.target.refuse_existing()
-    options.checkpoints.refuse_existing()
-    _check_device(options.device)
-    _refuse_contradictions(options)
-    if options.uncertainty:
-        refuse_impossible(options)
-    if options.cluster is not None:
-        workers = cluster(options.cluster)
-        if not local_workers(options.cluster):
-            with workers:  # raises ConfigError if a scheduler does not have them
-                pass
-    truth = None if options.truth is None else read_truth(options.truth)
-    if options.follow is None:
-        with options.source.open() as source:
-            _refuse_file(source, options)
-            if options.selection.axis_col is not None:
-                check_axis(source, options.selection.axis_col)
-    return truth
-
-
-def _refuse_contradictions(options: ReconOptions) -> None:
-    """Raise ConfigError for options that exclude each other, and for a file that cannot contain several volumes."""
-    if (pair := contradiction(options.given)) is not None:
-        raise ConfigError(f"{pair.name} cannot be combined with {pair.other}: {pair.why}. Nothing was computed.")
-    target = options.target
-    if options.method.volumes > 1 and target.written and target.output.suffix.lower() not in SUFFIXES:
-        raise ConfigError(
-            f"-o {target.output}: several volumes can only be written to HDF5. Use a name that ends in .h5."
-        )
-
-
-def _refuse_unfollowed(options: ReconOptions) -> None:
-    """Raise ConfigError for a method, or a choice of views, that cannot be used for a growing scan."""
-    if not options.streams:
-        return
-    method, views = options.streaming, options.selection.views
-    if not (views == "all" or views.startswith("every:")) or method.steps is not None:
-        raise ConfigError(
-            "Leave out --steps. Also leave out --views, unless it is every:K. The reason: --follow uses the "
-            "projections in the order in which "
-            "they are recorded, and fits for --seconds after the end of the scan."
-        )
-    try:
-        parse_views(views, [0.0])
-    except ValueError as error:
-        raise ConfigError(f"{error}. Nothing was written.") from error
-
-
-def _refuse_file(source: ScanSource, options: ReconOptions) -> None:
-    """Raise DataError in two cases: the scan is not finished and the options do not allow this, or a chunk of its file
-    does not fit into the memory when it is unpacked.
-    """
-    if not (source.finished or options.unfinished):
-        raise DataError(
-            f"{source.path} is not finished. {next_step(source.path)} To use the {len(source.table)} frames recorded "
-            "so far, add --unfinished. Nothing was written."
-        )
-    if source.unpack_bytes > (allowed := memory_of(options)):
-        needed_mb = math.ceil(source.unpack_bytes / 1e6)
-        raise DataError(
-            f"{source.path} is stored in chunks, and unpacking one chunk needs {size(source.unpack_bytes)} of "
-            f"memory, but {size(allowed)} is allowed. Use --memory {needed_mb}M if the "
-            "computer has this much memory, or copy the file with one frame in each chunk. Nothing was read."
-        )
-
-
-def _check_device(device: str) -> None:
-    """Raise ConfigError if methods cannot compute on the device."""
-    try:
-        backend_for(device)
-    except (ImportError, RuntimeError, ValueError) as error:
-        raise ConfigError(f"--device {device}: {error}. Leave out --device to compute on the CPU.") from error

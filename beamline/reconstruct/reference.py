@@ -20,7 +20,7 @@ from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.run_record import is_series_folder
-from beamline.storage.volumes.files import opened_volume, volume_format
+from beamline.storage.volumes.files import NXtomoproc, volume_format
 from drivers.base.clock import Clock
 from recon.auto import Auto
 from recon.base.volume import Volume
@@ -46,32 +46,30 @@ def with_reference(
             volume of the reference have the same name.
         ScanStopped: the reconstruction of the reference was stopped; its volume was removed.
     """
-    if volume_format(path) is None:
+    kind, scan = volume_format(path), None
+    if kind is None:
         folder = options.target.output.parent
         # one reference for all states of a series
         folder = folder.parent if is_series_folder(folder.parent) else folder
-        volume_path = folder / f"{safe_name(path.stem)}_reference.h5"
-        if volume_path == options.target.output:
+        scan, path = path, folder / f"{safe_name(path.stem)}_reference.h5"
+        if path == options.target.output:
             raise DataError(
-                f"The reference {path.name} is a scan. The volume of the reference and the output would have the "
-                f"same name, {volume_path}. Name another output. Nothing was computed."
+                f"The reference {scan.name} is a scan. The volume of the reference and the output would have the "
+                f"same name, {path}. Name another output. Nothing was computed."
             )
         if _too_few(options):
             return options  # the method reports this, and does not use a reference
-        if not volume_path.exists():
-            message = f"The reference {path.name} is a scan: it is reconstructed first, into {volume_path.name}"
-            sink(StateEntered("reference", message, {"reference": volume_path}, time=clock.now()))
-            target, source = OutputPaths(volume_path, None), SourceOptions(path)
+        if not path.exists():
+            source, target = SourceOptions(scan), OutputPaths(path, None)
             first = ReconOptions(source, target, Selection(), Auto(), seed=options.seed, memory=options.memory)
-            record = reconstruct(first, lambda event: None if isinstance(event, VolumeDone) else sink(event))
-            if record.ended_early:  # a reference that ended early is poor, and later calls would use it
-                volume_path.unlink()
-                raise ScanStopped(
-                    f"The reconstruction of the reference {path.name} was stopped, so its volume {volume_path} was "
-                    "removed. The later scan was not reconstructed."
-                )
-        path = _of_this_scan(volume_path, path)
-    with opened_volume(path) as record:
+            _reconstruct_first(first, reconstruct, sink, clock)
+        kind = NXtomoproc()
+    with kind.open(path) as record:
+        if scan is not None and not same_file(Path(record.raw_file), scan):
+            raise DataError(
+                f"{path} was made from {record.raw_file}, not from {scan.resolve()}. Move {path} away, or give the "
+                "volume of the reference instead of its scan. Nothing was changed."
+            )
         if record.kind is not VoxelKind.ATTENUATION or record.series is not None:
             raise DataError(f"{path} is not a single volume of attenuation; give a volume that `beamline recon` wrote.")
         data = np.array(record.volume.data[: record.grid.shape[0]], np.float32)
@@ -85,20 +83,29 @@ def with_reference(
     return replace(options, method=method)
 
 
+def _reconstruct_first(
+    first: ReconOptions, reconstruct: Callable[[ReconOptions, Sink], ReconRecord], sink: Sink, clock: Clock
+) -> None:
+    """Reconstruct the scan of the reference with the options `first`, and write its volume.
+
+    Raises:
+        ScanStopped: the reconstruction was stopped; the volume was removed.
+    """
+    name, volume_path = Path(first.source.path).name, first.target.output
+    message = f"The reference {name} is a scan: it is reconstructed first, into {volume_path.name}"
+    sink(StateEntered("reference", message, {"reference": volume_path}, time=clock.now()))
+    record = reconstruct(first, lambda event: None if isinstance(event, VolumeDone) else sink(event))
+    if record.ended_early:  # a reference that ended early is poor, and later calls would use it
+        volume_path.unlink()
+        raise ScanStopped(
+            f"The reconstruction of the reference {name} was stopped, so its volume {volume_path} was removed. The "
+            "later scan was not reconstructed."
+        )
+
+
 def _too_few(options: ReconOptions) -> bool:
     """Whether a finished scan has too few projections to test whether a reference helps."""
     if options.follow is not None:
         return False
     with options.source.open() as source:
         return stated_geometry(select(source, options.selection)).n_views < LEAST_VIEWS
-
-
-def _of_this_scan(volume_path: Path, scan: Path) -> Path:
-    """The path of a volume. Raises DataError if it was made from another scan."""
-    with opened_volume(volume_path) as record:
-        if not same_file(Path(record.raw_file), scan):
-            raise DataError(
-                f"{volume_path} was made from {record.raw_file}, not from {scan.resolve()}. Move {volume_path} away, "
-                "or give the volume of the reference instead of its scan. Nothing was changed."
-            )
-    return volume_path

@@ -20,7 +20,6 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.slab_run import busiest_first
 from beamline.storage.disk_file import scratch_array
-from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
 from recon.base.arrays import F64
@@ -31,7 +30,7 @@ from recon.base.slabs import Slab, part_of, slabs_of
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.error_bars import HALO, LEAST_VIEWS, ErrorBars, error_bars
-from recon.methods import by_name, names_where, with_settings
+from recon.methods import by_name, with_settings
 from recon.splatting.fit_method import Fit
 
 
@@ -135,22 +134,6 @@ def warnings_shown(warn: Warn) -> Iterator[None]:
 
 
 DecisionValues = Mapping[str, Sequence[Any]]
-
-
-def refuse_impossible(options: ReconOptions) -> None:
-    """Raise ConfigError, before any work, if error bars cannot be computed or written."""
-    if not all(method.error_bars for method in options.method.alternatives):
-        possible_methods = ", ".join(names_where(lambda each: each.error_bars))
-        raise ConfigError(
-            f"--uncertainty does not work with {options.method.name}, only with {possible_methods}. Leave out "
-            "--uncertainty, or choose another method."
-        )
-    if options.target.written and options.target.output.suffix.lower() not in SUFFIXES:
-        raise ConfigError(
-            "--uncertainty writes two volumes into one file, which needs HDF5: use -o "
-            f"{options.target.output.with_suffix('.h5')}. You can then export each of the two volumes with `beamline "
-            "export --dataset`."
-        )
 
 
 def refuse_views(method: Method, geometry: Geometry) -> None:

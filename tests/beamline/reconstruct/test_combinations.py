@@ -11,7 +11,7 @@ from beamline.core.errors import ConfigError
 from beamline.projections.selection import Selection
 from beamline.reconstruct.combinations import EXCLUDED, SLABS_RESUMED, contradiction
 from beamline.reconstruct.options import FollowTiming, OutputPaths, ReconOptions
-from beamline.reconstruct.plan import refuse_before_reading
+from beamline.reconstruct.refusals import refuse_before_reading
 from beamline.reconstruct.region import AroundSample
 from beamline.storage.readers.open import SourceOptions
 from recon import R2, TimeSeries
