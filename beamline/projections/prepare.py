@@ -107,11 +107,12 @@ def prepare_projections(
     used = np.union1d(used, offset_frames) if buffer is None else used
     projections = _corrected(plan, used, buffer, phases, warn)
     geometry = view_geometry.of(projections.view_ids)
-    if estimated := _estimated(scan, projections, geometry):
+    phases.enter("phase filter", "test reconstructions")
+    if estimated := _estimated(scan, projections, geometry, phases):
         scan = scan.with_steps(*estimated)
         plan = with_filters_of(plan, scan, usable.frames)
         if any(step.on(scan)[0] is not None for step in estimated):
-            # anything unusual in the frames has already been reported
+            phases.enter("correction")  # anything unusual in the frames has already been reported
             projections = _corrected(plan, used, buffer, phases)
     air_residual = compare_with_flats(scan, projections, warn)
     phases.enter("background, rings, held-out projections, hardening", "corrections")
@@ -131,10 +132,10 @@ def prepare_projections(
     return prepared if buffer is None else _with_unknown_filled(prepared)
 
 
-def _estimated(scan: SelectedScan, projections: Projections, geometry: Geometry) -> list[ViewStep]:
+def _estimated(scan: SelectedScan, projections: Projections, geometry: Geometry, phases: Phases) -> list[ViewStep]:
     """The steps whose settings follow from the corrected projections, with these settings."""
     steps = [step for step in in_order(scan.selection) if isinstance(step, EstimatedStep)]
-    estimated = [step.estimated(scan, projections, geometry) for step in steps]
+    estimated = [step.estimated(scan, projections, geometry, phases.progress) for step in steps]
     return [step for step in estimated if step is not None]
 
 

@@ -101,9 +101,14 @@ class ViewStep(PrepStep, Protocol):
 class EstimatedStep(Protocol):
     """A step whose settings may be estimated from the corrected projections of a finished scan."""
 
-    def estimated(self, scan: SelectedScan, views: Projections, geometry: Geometry) -> ViewStep | None:
+    def estimated(
+        self, scan: SelectedScan, views: Projections, geometry: Geometry, progress: Callable[[int, int], None]
+    ) -> ViewStep | None:
         """The step with the settings that these projections determine; they are corrected without the step. None if
         they determine no settings.
+
+        Args:
+            progress: function that gets the amount of work that is done, and of all work.
         """
 
 

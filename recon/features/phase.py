@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +37,7 @@ and 13.9 %.
 """
 _FIRST_SQUARE, _LARGEST_SQUARE = 1.0, 64.0  # squared lengths in pixels²: at the start of the search, and the largest
 _STANDARD_ERRORS = 3.0  # a filter must predict better than no filter by this many standard errors
+_USUAL_TESTS = 9  # usual number of test reconstructions
 _TRIAL_VIEWS, _ONE_IN, _SWEEPS, _TV_WEIGHT = 128, 8, 12, 5e-4  # settings of a test reconstruction with `EarlyTv`
 
 
@@ -124,7 +127,11 @@ class FilterLength:
 
 
 def length_by_held_out_views(
-    views: F32, geometry: Geometry, floor: float, known: NDArray[np.bool_]
+    views: F32,
+    geometry: Geometry,
+    floor: float,
+    known: NDArray[np.bool_],
+    progress: Callable[[int, int], None] = lambda done, usual: None,
 ) -> FilterLength | None:
     """The length of Paganin's filter that predicts held-out projections best. None if no length is better than no
     filter, or if there are too few held-out projections.
@@ -138,6 +145,7 @@ def length_by_held_out_views(
             middle.
         floor: least transmission.
         known: [row, col] pixels with data.
+        progress: function that gets, after each test reconstruction, their number so far and the usual number.
     """
     if geometry.n_views < LEAST_VIEWS:
         return None
@@ -152,7 +160,7 @@ def length_by_held_out_views(
     method, grid = EarlyTv(_SWEEPS, _TV_WEIGHT), Grid.matching(geometry)
     weights = None if known.all() else np.broadcast_to(known.astype(np.float32), views.shape)
 
-    norms: list[float] = []
+    norms, tests = list[float](), count(1)
 
     @cache
     def residuals_of(square: float) -> F64:
@@ -163,6 +171,8 @@ def length_by_held_out_views(
         norms[:] = decide.made[NORM]
         fringes = (1 + (2 * math.pi) ** 2 * square * _squared_frequencies(views)).astype(np.float32)
         differences = np.stack([_filtered_transmission(image, fringes) for image in images]) - np.exp(-views[unseen])
+        done = next(tests)
+        progress(done, max(done, _USUAL_TESTS))
         return np.sqrt(np.square(differences[:, known]).mean(axis=1, dtype=np.float64))
 
     best = preferred_strength(residuals_of, _FIRST_SQUARE)

@@ -76,7 +76,10 @@ def test_what_is_no_filter_is_refused(wrong: dict[str, object]) -> None:
 def test_views_held_out_tell_the_length_of_fringes(square: float) -> None:
     views, geometry = views_of_can(square)
     kept = views.copy()
-    shown = length_by_held_out_views(views, geometry, FLOOR, np.ones(views.shape[1:], np.bool_))
+    told = list[tuple[int, int]]()
+    everything = np.ones(views.shape[1:], np.bool_)
+    shown = length_by_held_out_views(views, geometry, FLOOR, everything, lambda *count: told.append(count))
+    assert [done for done, _ in told] == list(range(1, len(told) + 1)) and all(n <= usual for n, usual in told)
     assert shown is not None and 1 < shown.factor < 1.3 and shown.residual_drop > 0.1
     assert 0.5 * square < shown.length**2 < 1.3 * square  # its finest cosines have smaller eigenvalues than length²
     np.testing.assert_array_equal(views, kept)

@@ -5,6 +5,7 @@ state them.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -132,7 +133,9 @@ class Phase:
         search = 4 * TRIAL_ROWS * cols * TRIAL_COPIES * (part.geometry.n_views + cols) if searches else 0
         return StepMemory((7 if self.unsharp is None else 9) * part.view_bytes(paganin.reach), search)
 
-    def estimated(self, scan: SelectedScan, views: Projections, geometry: Geometry) -> Phase | None:
+    def estimated(
+        self, scan: SelectedScan, views: Projections, geometry: Geometry, progress: Callable[[int, int], None]
+    ) -> Phase | None:
         """This step with the filter that these projections show. None if the user stated the filter, or if the
         projections show nothing certain.
         """
@@ -144,7 +147,7 @@ class Phase:
         if not searches or not (overshoot := Overshoot.of(views.data)).certain:
             return None
         floor = scan.selection.step(Preparation).floor
-        filter = length_by_held_out_views(views.data, geometry, floor, ~views.masked)
+        filter = length_by_held_out_views(views.data, geometry, floor, ~views.masked, progress)
         if filter is None:
             return replace(self, explanation=f"{overshoot.in_words()} {_NO_FILTER}")
         if filter.residual_drop < LEAST_DROP:
