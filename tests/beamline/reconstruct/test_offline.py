@@ -74,6 +74,7 @@ def test_the_times_of_all_phases_are_told_and_add_up_to_the_time_that_it_took(tm
     assert sum(done["times"].values()) == pytest.approx(done["elapsed"], abs=0.35)  # three looks beside the phases
     assert list(done["times"]) == [
         "opening the scan", "flags and references", "tilt and references", "rotation axis", "jumps", "correction",
+        "phase filter",
         "background, rings, held-out projections, hardening", "compiling kernels", "reconstruction",
         "checking the volume", "FBP for comparison", "writing the volume", "report",
     ]  # fmt: skip
